@@ -82,7 +82,7 @@ def open_section(tiles: int, weights: int) -> list[str]:
         for factor in priors:
             whole.add(factor)
         found = levenberg_marquardt(whole, given.start, colamd_ordering(whole), STEPS, 0.0)
-        joint_posterior(whole.linearize(found.values), [last]).covariance
+        joint_posterior(whole.linearize(found.values), [last])
 
     dense = seconds(
         lambda: newton(given.graph, given.known, given.start, given.sizes, STEPS), 3, process_time

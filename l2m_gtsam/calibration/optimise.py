@@ -119,12 +119,12 @@ def most_after_step(error: float) -> float:
     return (1 + SEAM_RISE) * error + SEAM_RISE
 
 
-def refused(error: RuntimeError) -> bool:
-    """Return whether GTSAM calls a linear system indeterminate.
+def refused(error: Exception) -> bool:
+    """Return whether GTSAM calls a linear system indeterminate, or what it says as exact.
 
     Its IndeterminantLinearSystemException has no type in Python.
     """
-    return "ndetermina" in str(error)
+    return any(words in str(error) for words in ("ndetermina", "constrained noise model"))
 
 
 def _engine(

@@ -332,7 +332,7 @@ def unless_indeterminate(work: Callable[[], Result]) -> Result | None:
     """Return what GTSAM computes; None where a linear system is indeterminate to it."""
     try:
         return work()
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:
         if not refused(error):
             raise
         return None

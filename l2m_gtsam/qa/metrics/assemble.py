@@ -25,7 +25,7 @@ from l2m_gtsam.records.metrics import Halves, MapPicture, Metrics, Repeatability
 DRAWN = 6000  # readings of all sensors together, so that a report stays small
 FEWEST, MOST = 100, 500  # of each
 CELLS = 120  # along the longer side of the map's picture
-AROUND = 0.15  # of the drive, on each side
+AROUND, MOST_AROUND_M = 0.15, 1.0  # of the drive, on each side: no tile is read for far places
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def slice_map(
 def map_picture(field_map: Queryable, places: FloatArray) -> MapPicture:
     """Return the map around places, shape (N, 3), at their middle height, coarsely."""
     low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
-    around = AROUND * max(float((high - low).max()), 1.0)
+    around = min(AROUND * max(float((high - low).max()), 1.0), MOST_AROUND_M)
     height = float(np.median(places[:, 2]))
     cut = slice_map(field_map, low - around, high + around, height, CELLS)
     return MapPicture(row(cut.extent, 3), height, rows(cut.strength, 2), rows(cut.sigma, 3))

@@ -78,13 +78,30 @@ def test_where_cholesky_is_refused_covariances_come_from_qr(
     marginals = Marginals(linear, colamd_ordering(graph))
     alone = pose_covariances(marginals, len(P))
     together = pose_covariances_together(marginals, len(P))
-    pair, last = joint_posterior(linear, [X(5), X(2)]).covariance, joint_posterior(linear, [X(8)]).covariance
+    pair, last = (joint_posterior(linear, keys).covariance for keys in ([X(5), X(2)], [X(8)]))
     for k, true in enumerate(P):
         assert off(alone[k], true) < 1e-5
         assert off(together[k], true) < 1e-5
     assert off(pair[:6, :6], P[5]) < 1e-5
     assert off(pair[6:, 6:], P[2]) < 1e-5
     assert off(last, P[8]) < 1e-5
+
+
+@pytest.mark.parametrize(("start", "step"), [([0.1] * 6, [0.02] * 6), *FAR_APART])
+@pytest.mark.parametrize("keys", [[X(8)], [X(3), X(0)]])
+def test_a_posterior_tells_what_a_step_promises(
+    start: list[float], step: list[float], keys: list[int]
+) -> None:
+    """The error of the linear graph at zero less that at its solution, whoever is asked for."""
+    graph, values, _ = chain(start, step)
+    rng, away = np.random.default_rng(6), gtsam.Values()
+    for key in values.keys():  # noqa: SIM118 - GTSAM's values cannot be iterated
+        away.insert(key, values.atPose3(key).retract(0.1 * rng.normal(size=6)))
+    linear = graph.linearize(away)
+    solution = linear.optimize(colamd_ordering(graph), gtsam.EliminateQR)
+    promised = linear.error(away.zeroVectors()) - linear.error(solution)
+    assert promised > 1.0
+    assert joint_posterior(linear, keys).decrease == pytest.approx(promised, rel=1e-6)
 
 
 @pytest.mark.parametrize(("start", "step"), FAR_APART)
@@ -179,7 +196,7 @@ def test_what_no_factor_tells_is_refused_in_one_line() -> None:
     for k in (0, 1):
         values.insert(X(k), gtsam.Pose3())
     with pytest.raises(CalibrationError, match="orders of magnitude"), reported_ill_conditioning():
-        joint_posterior(graph.linearize(values), [X(1)]).covariance
+        joint_posterior(graph.linearize(values), [X(1)])
 
 
 def test_covariances_are_in_the_order_asked_for_whatever_gtsam_eliminates_first() -> None:
