@@ -108,6 +108,11 @@ class Belief:
         at = POSE + SENSOR * np.arange(len(self.sensors.names))[:, None] + np.arange(SENSOR)
         return np.asarray(self.covariance[at[:, :, None], at[:, None, :]])
 
+    @property
+    def known_sensors(self) -> KnownSensors:
+        """The sensors with the covariances that they have by now."""
+        return replace(self.sensors, covariance=self.calibration_covariance)
+
     def predicted(self, step: gtsam.Pose3, covariance: FloatArray) -> "PredictedBelief":
         """Return the joint belief of this key pose and the step to the next.
 

@@ -64,7 +64,7 @@ class OnlinePose:
     covariance
         Of a right perturbation of it, rotation (rad) before translation (m), shape (6, 6).
     sensors
-        Calibrations as they are known by then.
+        Calibrations as they are known by then, with the covariances of then.
     """
 
     stamp_ns: int
@@ -75,8 +75,9 @@ class OnlinePose:
     @classmethod
     def of(cls, stamp_ns: int, belief: Belief) -> "OnlinePose":
         """Return a belief as it is handed out."""
-        T = as_transform(belief.pose)
-        return cls(stamp_ns, T, belief.pose_covariance, belief.sensors)
+        # A part of the belief's covariance would keep all of it for as long as the pose is kept.
+        covariance = belief.pose_covariance.copy()
+        return cls(stamp_ns, as_transform(belief.pose), covariance, belief.known_sensors)
 
 
 @dataclass
@@ -256,7 +257,7 @@ class OnlineSlam:
         """Search for the place of a key pose that odometry does not know, with what is known."""
         if self.estimator is not None:
             belief = self.estimator.finish()
-            self.sensors = replace(belief.sensors, covariance=belief.calibration_covariance)
+            self.sensors = belief.known_sensors
         self.estimator, self.stamp_ns = None, key_pose.stamp_ns
         self._begin_search(key_pose)
         text = "the place of the vehicle is lost with odometry: it is searched for in the map"

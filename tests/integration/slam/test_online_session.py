@@ -10,6 +10,7 @@ from l2m_gtsam.data import FloatArray, KnownSensor, RigidTransform
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.events import EventKind
+from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, key_poses_of
 from l2m_gtsam.slam.online.odometry_check import OdometryPose
 from l2m_gtsam.slam.online.replay import FieldReading, give, messages
@@ -351,6 +352,32 @@ def test_without_a_map_it_is_the_explorer_and_it_resumes() -> None:
         errors = (np.sqrt(np.mean(each**2)) for each in (run.off(recorded.truth), off[rows]))
         assert next(errors) < 1.5 * next(errors)
         assert run.nees(recorded.truth).mean() < 12
+
+
+@pytest.mark.parametrize("has_map", [True, False])
+def test_refined_calibrations_are_handed_out_with_what_is_known_of_them_then(
+    has_map: bool,
+) -> None:
+    """Not with the covariances that they had before the drive."""
+    sensors, off = random_sensors(2, 3), np.repeat([5e-3, 5e-3, 0.3], [3, 9, 3])
+    known = calibrated(sensors, sigma=off, rng=np.random.default_rng(5))
+    options = SlamOptions.model_validate(
+        {
+            "key_poses": COARSE,
+            "calibration": "refined",
+            "tiles": {"modes": 50, "learn_over_m": 5.0},
+        }
+    )
+    world = dipole_world(2)
+    recorded = slam_drive(world, sensors, laps(25, (1.9, 1.4)), np.random.default_rng(2))
+    slam = OnlineSlam(known, options, world if has_map else None)
+    last = driven(slam, messages(recorded.recording)).poses[-1]
+    assert isinstance(slam.estimator, Explorer | Follower)
+    own = slam.estimator.belief.calibration_covariance
+    np.testing.assert_array_equal(last.sensors.covariance, own)
+    assert last.covariance.base is None  # of the whole covariance, which it would keep
+    offset = np.sqrt(np.einsum("sii->si", own)[:, 12:])
+    assert (offset < 0.9 * 0.3).all()  # H is learnt, by a tenth of its sigma at least
 
 
 def test_one_sensor_in_an_unknown_field_is_reported_at_once() -> None:
