@@ -11,7 +11,14 @@ import numpy as np
 from l2m_gtsam.batch.files import SavedMap, ensure_folder
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow
-from l2m_gtsam.batch.slam import MAP_FILE, TRAJECTORY_FILE, SlamInput
+from l2m_gtsam.batch.slam import (
+    MAP_FILE,
+    REFINED_FILE,
+    TRAJECTORY_FILE,
+    SlamInput,
+    check_not_replaced,
+    write_refined,
+)
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray, Recording, RigidTransform, Trajectory
 from l2m_gtsam.errors import LidarError, SyncError
@@ -32,9 +39,11 @@ from l2m_gtsam.slam.online.replay import give, messages, with_scans
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
-from l2m_gtsam.slam.options import Usage
+from l2m_gtsam.slam.options import CalibrationUse, Usage
+from l2m_gtsam.slam.result import refined
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
+from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.online_log import (
     LogLine,
@@ -112,6 +121,7 @@ def slam_online(
     """
     saved = None if given.map is None else SavedMap.read(given.map)
     calibration = read_sensors(given.calibration)
+    check_not_replaced(given.calibration, out)
     truth = None if given.truth is None else read_tum(given.truth)
     recording = read_drive_or_follow(given.bag, config, progress)
     if len(recording.trajectory) < 2:
@@ -128,6 +138,7 @@ def slam_online(
         run = _Run(begun, log, out / STATE_FILE, config.slam.online.save_every_s)
         scans = () if matcher is None else bag_scans(given.bag, config, silent)
         run.drive(recording, scans, progress)
+    _write_calibration_so_far(run.last, calibration, given, recording, config, out)
     trajectory = logged_trajectory(run.lines)
     write_tum(out / TRAJECTORY_FILE, trajectory)
     if saved is None:
@@ -213,6 +224,7 @@ class _Run:
         self._slam, self._after_ns, self._log = begun.slam, begun.after_ns, log
         self._state, self._every_ns = state, round(save_every_s / NS)
         self.lines, self.cost_s = list(begun.lines), list[float]()
+        self.last: OnlinePose | None = None
 
     def drive(self, recording: Recording, scans: Iterable[Scan], progress: Progress) -> None:
         """Give all messages that are later than those that it has had."""
@@ -240,6 +252,7 @@ class _Run:
     def _write(self, poses: Sequence[OnlinePose], events: Sequence[OnlineEvent]) -> None:
         new = [LogLine(each.stamp_ns, event=(each.kind.value, each.text)) for each in events]
         new += [pose_line(each) for each in poses]
+        self.last = poses[-1] if poses else self.last
         self._log.add(new)
         self.lines += new
 
@@ -248,6 +261,27 @@ def pose_line(pose: OnlinePose) -> LogLine:
     """Return a pose as a line of the log."""
     own = {"R": pose.T_map_lidar.R, "p": pose.T_map_lidar.t, "covariance": pose.covariance}
     return LogLine(pose.stamp_ns, pose={name: each.tolist() for name, each in own.items()})
+
+
+def _write_calibration_so_far(
+    last: OnlinePose | None,
+    before: CalibrationResult,
+    given: SlamInput,
+    recording: Recording,
+    config: Config,
+    out: Path,
+) -> None:
+    """Write the calibration as the last pose has it, where it was refined; else there is none."""
+    (out / REFINED_FILE).unlink(missing_ok=True)
+    if last is None or config.slam.calibration is not CalibrationUse.REFINED:
+        return
+    found = replace(
+        refined(before, last.sensors),
+        bag=recording.source,
+        map=None if given.map is None else source_file(given.map),
+        options=config.model_dump(mode="json", include={"bag", "lidar", "slam"}),
+    )
+    write_refined(out, found)
 
 
 def _write_map_so_far(

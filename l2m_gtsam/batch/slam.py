@@ -221,8 +221,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     _check_folder(out)
     saved = None if given.map is None else SavedMap.read(given.map)
     calibration = read_sensors(given.calibration)
-    if (out / REFINED_FILE).exists() and given.calibration.samefile(out / REFINED_FILE):
-        raise OutputError(f"{given.calibration}: is what is read; choose another --out")
+    check_not_replaced(given.calibration, out)
     truth = None if given.truth is None else read_tum(given.truth)
     recording = read_drive_or_follow(given.bag, config, progress)
     scanned = read_evidence(given.bag, recording, saved, config, progress)
@@ -307,6 +306,18 @@ def _check_folder(out: Path) -> None:
         )
 
 
+def check_not_replaced(calibration: Path, out: Path) -> None:
+    """Raise an OutputError if the refined calibration would be written over what is read."""
+    if (out / REFINED_FILE).exists() and calibration.samefile(out / REFINED_FILE):
+        raise OutputError(f"{calibration}: is what is read; choose another --out")
+
+
+def write_refined(out: Path, calibration: CalibrationResult) -> None:
+    """Write a calibration as a drive refined it, with a note on its verdict."""
+    notes = (*calibration.notes, REFINED)
+    write_calibration(out / REFINED_FILE, replace(calibration, bags=(), notes=notes))
+
+
 def _write(found: _Found, record: LocalisationRecord, config: Config, out: Path) -> None:
     result, odometry = found.result, found.recording.trajectory
     write_tum(out / TRAJECTORY_FILE, result.trajectory)
@@ -316,15 +327,8 @@ def _write(found: _Found, record: LocalisationRecord, config: Config, out: Path)
     with atomic_path(out / GRAPH_FILE) as temporary:
         write_g2o(temporary, found.solution)
     if result.calibration is not None:
-        refined = replace(
-            result.calibration,
-            bag=result.bag,
-            bags=(),
-            map=result.map,
-            options=record.options,
-            notes=(*result.calibration.notes, REFINED),
-        )
-        write_calibration(out / REFINED_FILE, refined)
+        made = replace(result.calibration, bag=result.bag, map=result.map, options=record.options)
+        write_refined(out, made)
     write_slam(out / SLAM_FILE, record)
 
 

@@ -19,7 +19,7 @@ from l2m_gtsam.records.localisation import (
     SensorUse,
 )
 from l2m_gtsam.slam.disturbances import slip_notes
-from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.misfit import fits_decoy_as_well
 from l2m_gtsam.slam.pose_graph import PoseGraph
 from l2m_gtsam.slam.solution import DriveSolution
@@ -68,7 +68,7 @@ def localisation_result(
         odometry=odometry,
         drift=drift_figures(trajectory, odometry),
         sensors=tuple(_use(solution, i) for i in range(len(drive.sensors.names))),
-        calibration=None if refine is None else refined(refine, solution),
+        calibration=None if refine is None else refined(refine, known_by(solution)),
         notes=slip_notes(steady, solution.poses, solution.scale_error),
         bag=None,
         map=None,
@@ -105,18 +105,23 @@ def drift_figures(localised: Trajectory, odometry: Trajectory) -> DriftFigures:
     )
 
 
-def refined(calibration: CalibrationResult, solution: DriveSolution) -> CalibrationResult:
+def known_by(solution: DriveSolution) -> KnownSensors:
+    """Return the sensors of a drive with the covariances that it left them."""
+    return replace(solution.drive.sensors, covariance=solution.calibration_covariance)
+
+
+def refined(calibration: CalibrationResult, sensors: KnownSensors) -> CalibrationResult:
     """Return a calibration with the sensors that a drive refined; the others stay."""
-    names = solution.drive.sensors.names
-    sensors = [
-        _refined(entry, solution, names.index(entry.sensor)) if entry.sensor in names else entry
+    names = sensors.names
+    entries = [
+        _refined(entry, sensors, names.index(entry.sensor)) if entry.sensor in names else entry
         for entry in calibration.sensors
     ]
-    return replace(calibration, sensors=tuple(sensors), disagreements=())
+    return replace(calibration, sensors=tuple(entries), disagreements=())
 
 
-def _refined(entry: SensorCalibration, solution: DriveSolution, i: int) -> SensorCalibration:
-    sensors, covariance = solution.drive.sensors, solution.calibration_covariance[i]
+def _refined(entry: SensorCalibration, sensors: KnownSensors, i: int) -> SensorCalibration:
+    covariance = sensors.covariance[i]
     distortion = Distortion.from_vector(sensors.distortion[i])
     rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
     clock = entry.time_offset

@@ -15,6 +15,7 @@ from l2m_gtsam.batch import online_slam
 from l2m_gtsam.errors import LidarError
 from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
+from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.pose_files import read_tum
 from tests.drives.yard import CalibratedYard, calibrated_yard
 from tests.support.command_line import complaint_here, l2m
@@ -35,7 +36,7 @@ def command(yard: CalibratedYard, tmp_path_factory: pytest.TempPathFactory) -> l
     """A drive in the map of the yard, whose state is saved every five seconds."""
     content = json.loads(yard.yard.config.read_text())
     # The meander turns within one pose: no jump, but the motion of this vehicle.
-    slam = {"jumps": {"position_m": 1.0}, "online": {"save_every_s": 5}}
+    slam = {"jumps": {"position_m": 1.0}, "online": {"save_every_s": 5}, "calibration": "refined"}
     content["slam"] = {"key_poses": {"distance_m": 0.3, "angle_deg": 30}, **slam}
     config = tmp_path_factory.mktemp("online") / "slam.yaml"
     config.write_text(json.dumps(content))
@@ -58,8 +59,22 @@ def test_poses_come_with_covariances(whole: Path) -> None:
     assert len(poses) == len(trajectory)
     assert np.all(np.linalg.eigvalsh([each["covariance"] for each in poses]) > 0)
     assert {each.name for each in whole.iterdir()} == {
-        "online.jsonl", "state.npz", "trajectory.tum",
+        "online.jsonl", "refined.yaml", "state.npz", "trajectory.tum",
     }  # fmt: skip
+
+
+def test_the_refined_calibration_is_written_and_read(
+    command: list[str], whole: Path, yard: CalibratedYard
+) -> None:
+    """Where a calibration is; it is not written over while it is what is read."""
+    before, after = (read_sensors(each) for each in (yard.calibration, whole / "refined.yaml"))
+    for was, now in zip(before.sensors, after.sensors, strict=True):
+        assert now.sensor == was.sensor
+        assert np.trace(now.covariance[12:, 12:]) < np.trace(was.covariance[12:, 12:])
+    again = [
+        str(whole / "refined.yaml") if each == str(yard.calibration) else each for each in command
+    ]
+    assert "choose another --out" in complaint_here(*again, "--out", whole)
 
 
 def test_killed_it_goes_on_from_its_state(
@@ -112,3 +127,4 @@ def test_without_the_extra_clouds_take_no_part_and_it_is_said(
     arguments = ("--calibration", yard.calibration, "--config", config, "--out", out)
     l2m("slam", yard.drive, "--online", *arguments)
     assert "point clouds take no part: poses from" in (out / "online.jsonl").read_text()
+    assert not (out / "refined.yaml").exists()
