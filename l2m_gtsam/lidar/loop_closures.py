@@ -1,7 +1,7 @@
 """Loop closures: scans of revisited places, registered on those of earlier visits."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,10 +139,28 @@ def closed_loop(
     options
         How they are registered.
     """
+    work = closing_loop(earlier, here, first, scan, options)
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            closed: LoopClosure | Refusal = end.value
+            return closed
+
+
+def closing_loop(
+    earlier: KeyScan,
+    here: KeyScan,
+    first: Surface,
+    scan: Surface,
+    options: RegistrationOptions,
+) -> Generator[None, None, LoopClosure | Refusal]:
+    """Return the same; yields between the registrations one way and the other."""
     guess = between(earlier.T, here.T)
     found = register(scan, first, guess, options)
     refusal = found.refusal(options)
     if refusal is None:
+        yield
         refusal = register(first, scan, found.T.inverse(), options).refusal(options)
     if refusal is not None:
         return refusal

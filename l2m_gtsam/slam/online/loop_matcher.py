@@ -1,6 +1,10 @@
-"""Scans on those of earlier visits, as they come: loops of key poses where there is no map."""
+"""Scans on those of earlier visits, as they come: loops of key poses where there is no map.
 
-from collections.abc import Callable, Sequence
+A registration takes as long as all else at a key pose, and a scan has up to four: they are spread
+over the key poses that come meanwhile.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,7 +12,7 @@ import numpy as np
 
 from l2m_gtsam.data import RigidTransform
 from l2m_gtsam.geometry import between, compose, difference, moved
-from l2m_gtsam.lidar.loop_closures import KeyScan, LoopOptions, candidates, closed_loop
+from l2m_gtsam.lidar.loop_closures import KeyScan, LoopOptions, candidates, closing_loop
 from l2m_gtsam.lidar.odometry import LEAST_POINTS
 from l2m_gtsam.lidar.registration import PoseEstimate, Refusal
 from l2m_gtsam.lidar.surface import Surface
@@ -18,6 +22,7 @@ from l2m_gtsam.slam.online.scan_matcher import ScanLinks
 from l2m_gtsam.slam.options import DriftOptions
 
 CONTRADICTS = "a loop of scans is left out: it contradicts odometry and readings"
+PIECE_M = 0.05  # of path, in which a surface is made or two scans are registered one way
 POSE = 6
 
 
@@ -52,6 +57,31 @@ class KeptScan:
         return KeyScan(self.stamp_ns, self.points, T, self.path_m)
 
 
+@dataclass
+class ScanBehind:
+    """A scan that is compared, as seen from the newest key pose.
+
+    Attributes
+    ----------
+    key_pose
+        Number of that key pose.
+    expected
+        Where it is expected.
+    T_key_scan
+        The lidar at the scan in its frame, by odometry.
+    """
+
+    key_pose: int
+    expected: PoseEstimate
+    T_key_scan: RigidTransform
+
+    def go_on(self, key_pose: ArrivedKeyPose, expected: PoseEstimate) -> None:
+        """See it from the next key pose."""
+        step = RigidTransform(key_pose.R, key_pose.p)
+        self.key_pose, self.expected = key_pose.number, expected
+        self.T_key_scan = between(step, self.T_key_scan)
+
+
 class LoopMatcher:
     """Registers scans on those of earlier visits to their places.
 
@@ -75,6 +105,8 @@ class LoopMatcher:
         self._options, self._edge, self._drift, self._largest = options, edge, drift, largest
         self.kept: list[KeptScan] = []
         self.path_m, self.last_m = 0.0, -np.inf  # so far, and at the last scan that was compared
+        self._behind: ScanBehind | None = None
+        self._work: Iterator[Links | str | None] = iter(())  # what is left of comparing it
 
     def loops(
         self,
@@ -82,7 +114,9 @@ class LoopMatcher:
         expected: PoseEstimate,
         known: Callable[[int], PoseEstimate],
     ) -> ScanLinks:
-        """Return the loops that a key pose closes, and keep a scan of a new place.
+        """Return the loops of a key pose that are found by now, and keep a scan of a new place.
+
+        A scan may be that of a key pose before: odometry carries on what it says.
 
         Parameters
         ----------
@@ -94,57 +128,74 @@ class LoopMatcher:
             Returns where an earlier key pose is known to have been.
         """
         self.path_m += key_pose.length_m
-        found, refused = [Links.none()], list[str]()
+        if self._behind is not None:
+            self._behind.go_on(key_pose, expected)
+        found = list[Links | str | None]()
         for each in key_pose.scans:
             if self.path_m - self.last_m < self._options.key_distance_m:
                 continue
             if len(each.points) < LEAST_POINTS:
-                refused.append("a scan has too few points")
+                found.append("a scan has too few points")
                 continue
             self.last_m = self.path_m
-            for closed in self._compared(key_pose, each, expected, known):
-                if isinstance(closed, str):
-                    refused.append(closed)
-                else:
-                    found.append(closed)
-        return ScanLinks(Links.joined(found), tuple(refused))
+            found += self._work  # all that is left of the scan before
+            self._behind = ScanBehind(key_pose.number, expected, each.T_key_scan)
+            self._work = self._comparing(self._behind, key_pose.stamp_ns, each, known)
+        found += self._advanced(max(round(key_pose.length_m / PIECE_M), 1))
+        links = [each for each in found if isinstance(each, Links)]
+        refused = tuple(each for each in found if isinstance(each, str))
+        return ScanLinks(Links.joined([Links.none(), *links]), refused)
 
     def resume(self, kept: Sequence[KeptScan], path_m: float, last_m: float) -> None:
-        """Go on with what was kept before."""
+        """Go on with what was kept before; a scan that was being compared is left out."""
         self.kept, self.path_m, self.last_m = list(kept), path_m, last_m
+        self._behind, self._work = None, iter(())
 
-    def _compared(
-        self,
-        key_pose: ArrivedKeyPose,
-        at: ScanAtKeyPose,
-        expected: PoseEstimate,
-        known: Callable[[int], PoseEstimate],
-    ) -> list[Links | str]:
-        """Return loops of a scan, or why they are left out."""
-        surface, options = Surface(at.points, self._edge), self._options
-        T = compose(expected.T, at.T_key_scan)
-        here = KeyScan.of(key_pose.stamp_ns, surface, T, self.path_m)
-        before = [known(each.key_pose) for each in self.kept]
-        scans = [each.seen_from(there.T) for each, there in zip(self.kept, before, strict=True)]
+    def _advanced(self, pieces: int) -> list[Links | str]:
+        """Do so many pieces of the work, and return what they found."""
         found = list[Links | str]()
+        for outcome in self._work:
+            if outcome is not None:
+                found.append(outcome)
+                continue
+            pieces -= 1
+            if not pieces:
+                break
+        return found
+
+    def _comparing(
+        self,
+        behind: ScanBehind,
+        stamp_ns: int,
+        at: ScanAtKeyPose,
+        known: Callable[[int], PoseEstimate],
+    ) -> Iterator[Links | str | None]:
+        """Yield loops of a scan, or why they are left out; None after other pieces of the work."""
+        own, options = behind.key_pose, self._options
+        T = compose(behind.expected.T, at.T_key_scan)
+        surface = Surface(at.points, self._edge)
+        here = KeyScan.of(stamp_ns, surface, T, self.path_m)
+        scans = [each.seen_from(known(each.key_pose).T) for each in self.kept]
+        contradicts = False
         for row in candidates(scans, here, options):
-            first = self.kept[row].surface
-            closed = closed_loop(scans[row], here, first, surface, options.registration)
+            yield None
+            earlier = self.kept[row]
+            closed = yield from closing_loop(
+                scans[row], here, earlier.surface, surface, options.registration
+            )
             if isinstance(closed, Refusal):
                 continue  # of single scans most see too little of each other
-            earlier = self.kept[row]
             seen = PoseEstimate(closed.T_from_to, closed.covariance)
-            seen = carried_on(seen, at.T_key_scan.inverse(), self._drift)
+            seen = carried_on(seen, behind.T_key_scan.inverse(), self._drift)
             seen = seen_from_before(seen, earlier.T_key_scan, self._drift)
-            if self._fits(seen, before[row], expected):
-                found.append(Links.single(earlier.key_pose, key_pose.number, seen))
+            if self._fits(seen, known(earlier.key_pose), behind.expected):
+                yield Links.single(earlier.key_pose, behind.key_pose, seen)
             else:
-                found.append(CONTRADICTS)
+                contradicts = True
+                yield CONTRADICTS
         is_new = all(np.linalg.norm(each.T.t - T.t) >= options.key_distance_m for each in scans)
-        if is_new and CONTRADICTS not in found:  # true scans would contradict one that lies
-            own = here.stamp_ns, here.points, here.path_m
-            self.kept.append(KeptScan(key_pose.number, at.T_key_scan, *own))
-        return found
+        if is_new and not contradicts:  # true scans would contradict one that lies
+            self.kept.append(KeptScan(own, at.T_key_scan, stamp_ns, here.points, here.path_m))
 
     def _fits(self, seen: PoseEstimate, before: PoseEstimate, expected: PoseEstimate) -> bool:
         """Return whether a loop is where both poses' estimates expect it.
