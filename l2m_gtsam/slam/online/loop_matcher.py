@@ -23,7 +23,6 @@ from l2m_gtsam.slam.options import DriftOptions
 
 CONTRADICTS = "a loop of scans is left out: it contradicts odometry and readings"
 PIECE_M = 0.05  # of path, in which a surface is made or two scans are registered one way
-POSE = 6
 
 
 @dataclass(frozen=True)
