@@ -47,6 +47,17 @@ class Resolution:
         """Return about how many modes a square box of this edge in metres has."""
         return MODE_DENSITY * edge**2 * (self.floor**2 + self.ceiling**2)
 
+    def evenly_within(self, modes: float, edge: float) -> "Resolution":
+        """Return it with the shortest waves left out, of whichever side, down to so many modes.
+
+        Which side's sources are the stronger and the nearer does not count: what is learnt of that
+        from few readings at uncertain places is not to be relied upon.
+        """
+        squares = modes / (MODE_DENSITY * edge**2)
+        coarser = min(self.floor, self.ceiling)
+        most = float(np.sqrt(max(squares / 2, squares - coarser**2)))
+        return Resolution(min(self.floor, most), min(self.ceiling, most))
+
 
 def resolution_of(hyperparameters: Hyperparameters, density: float, share: float) -> Resolution:
     """Return which modes readings of a density carry information on.

@@ -52,8 +52,7 @@ class FieldPrior:
 
 def coarser(prior: FieldPrior, modes: int) -> FieldPrior:
     """Return a prior whose tiles have so many waves at most."""
-    fewer = prior.options.model_copy(update={"modes": modes})
-    return replace(prior, resolution=within_budget(prior.resolution, fewer))
+    return replace(prior, resolution=prior.resolution.evenly_within(modes, prior.options.edge))
 
 
 def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> FieldPrior:
@@ -80,13 +79,8 @@ def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> 
         hyperparameters = learn(readings, NO_SOURCES, tiling, share, learning).hyperparameters
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
     wanted = resolution_of(hyperparameters, density, defaults.mode_share)
-    return FieldPrior(hyperparameters, within_budget(wanted, options), options)
-
-
-def within_budget(resolution: Resolution, options: TileOptions) -> Resolution:
-    """Return the resolution, reduced where a tile would exceed the limit of waves."""
-    over = float(np.sqrt(max(resolution.modes(options.edge) / options.modes, 1.0)))
-    return Resolution(resolution.floor / over, resolution.ceiling / over)
+    kept = wanted.evenly_within(options.modes, options.edge)
+    return FieldPrior(hyperparameters, kept, options)
 
 
 def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) -> FieldPrior:

@@ -17,7 +17,6 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     WaveTile,
     anchor_tiles,
     field_prior,
-    within_budget,
 )
 from tests.worlds.exact import dipole_world
 
@@ -108,12 +107,19 @@ def test_the_likely_weights_predict_what_was_not_read() -> None:
 
 
 def test_waves_stay_within_their_number() -> None:
-    rough = within_budget(Resolution(20.0, 12.0), OPTIONS)
+    rough = Resolution(20.0, 12.0).evenly_within(OPTIONS.modes, OPTIONS.edge)
     tile = WaveTile.about(FieldPrior(Hyperparameters(), rough, OPTIONS), np.eye(3), places(1))
     # The count is that of a disc of half waves; its rim and the uniform field add to it.
     assert OPTIONS.modes < len(tile) < 1.3 * OPTIONS.modes
-    assert rough.floor / rough.ceiling == pytest.approx(20.0 / 12.0)
-    assert within_budget(Resolution(1.0, 1.0), OPTIONS) == Resolution(1.0, 1.0)
+    assert rough.floor == rough.ceiling
+
+    # A side that needs fewer leaves its share to the other.
+    smooth = Resolution(20.0, 1.0).evenly_within(OPTIONS.modes, OPTIONS.edge)
+    assert smooth.ceiling == 1.0
+    assert smooth.floor > rough.floor
+    assert smooth.modes(OPTIONS.edge) == pytest.approx(rough.modes(OPTIONS.edge))
+    enough = Resolution(1.0, 1.0)
+    assert enough.evenly_within(OPTIONS.modes, OPTIONS.edge) == enough
 
 
 def test_a_prior_is_not_learnt_from_nothing() -> None:
