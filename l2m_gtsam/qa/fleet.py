@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import median_abs_deviation
+from scipy.special import ndtri
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.metrics.mounting import gains
@@ -202,7 +202,7 @@ def expected_deviation(value: FloatArray, sigma: FloatArray) -> FloatArray:
     """
     # Of N normal values the median has pi / 2 times the variance of the mean.
     of_median = MEDIAN * np.median(sigma) ** 2 / len(value)
-    spread = float(median_abs_deviation(value, scale="normal"))
+    spread = float(np.median(np.abs(value - np.median(value))) / ndtri(0.75))
     smallest = np.finfo(float).tiny  # values that are exact and all alike
     return np.asarray(np.maximum(np.sqrt(sigma**2 + of_median), max(spread, smallest)))
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.stats import chi2
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.solve.chi_square import exceeded_by
 
 AXES = 3
 ROUNDS = 5  # limit of removing changed stretches and solving again
@@ -83,7 +83,7 @@ def _misfitting(fit: ReadingFits) -> BoolArray:
     there = freedom > 0
     # Where all of a map is slightly wrong, a window is compared with the others.
     scale = max(1.0, float(np.median(left[there] / freedom[there]))) if there.any() else 1.0
-    return there & (left > scale * chi2.isf(CHANCE / len(fit.p), np.maximum(freedom, 1)))
+    return there & (left > scale * exceeded_by(CHANCE / len(fit.p), np.maximum(freedom, 1)))
 
 
 def _rejected(fit: ReadingFits) -> BoolArray:
@@ -169,7 +169,7 @@ def slips(drive: Drive, poses: list[gtsam.Pose3], scale_error: float = 0.0) -> I
     squared = np.einsum(
         "ni,ni->n", errors, np.linalg.solve(drive.steps.covariance, errors[:, :, None])[:, :, 0]
     )
-    apart = squared > chi2.isf(SLIP_CHANCE / len(squared), FREEDOM)
+    apart = squared > exceeded_by(SLIP_CHANCE / len(squared), FREEDOM)
     seconds = 1e-9 * (drive.stamp_ns - drive.stamp_ns[0])
     for first, last in runs(apart):
         moved = errors[first:last].sum(axis=0)

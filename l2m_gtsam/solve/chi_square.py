@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtrc, gammaincinv, gammaln, xlogy
+from scipy.special import chdtrc, gammainccinv, gammaincinv, gammaln, xlogy
 
 from l2m_gtsam.data import FloatArray
 
@@ -22,6 +22,14 @@ def chance_beyond(value: Any, freedom: Any) -> FloatArray:
     NaN where there is no freedom.
     """
     return np.asarray(chdtrc(_known(freedom), np.maximum(value, 0.0)))
+
+
+def exceeded_by(share: Any, freedom: Any) -> FloatArray:
+    """Return what this share of all values is above, to full precision for the smallest shares.
+
+    NaN where there is no freedom.
+    """
+    return np.asarray(2 * gammainccinv(_known(freedom) / 2, share))
 
 
 def density(value: FloatArray, freedom: float) -> FloatArray:

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from l2m_factors import X
 from l2m_gtsam.data import BoolArray
@@ -60,7 +60,7 @@ def gain_of(
         for k, (pose, own) in enumerate(zip(poses, d, strict=True))
     }
     sigma = np.sqrt(marginals.variance_along(along)) if squared else 0.0
-    doubt = float(norm.cdf(-0.5 * squared / sigma)) if sigma else 0.5
+    doubt = float(ndtr(-0.5 * squared / sigma)) if sigma else 0.5
     moved = float(np.sqrt(squared / len(d)))
     return Gain(likelier, moved, doubt, shown=likelier > 0 and doubt <= MOST_DOUBT)
 

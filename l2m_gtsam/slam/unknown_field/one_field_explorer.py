@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
@@ -38,6 +37,7 @@ from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
 )
 from l2m_gtsam.slam.unknown_field.smoothed_drive import SmoothedDrive, smoothed
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior, capped_prior, spectrum_at
+from l2m_gtsam.solve.chi_square import exceeded_by
 
 # Of the filter's noise. Slow errors count as white there: of errors that last 3 to 4 s, with a
 # reading each 0.43 s, white ones 3.7 to 4.5 times as large say as much. On the model ship 2, 3, 4
@@ -48,7 +48,7 @@ GROWN = 2.0  # path, after which the drive is solved again: all of it takes twic
 LEFT = 1.25  # the same where the vehicle has left the box, or a correction was refused
 ROUNDS = (1, 1, 2)  # of the solution's stages; with as many as off line poses are no better
 NEAR = 1.0  # lengths of the field, to the faces of the box: nearer, these matter
-IMPOSSIBLE = float(chi2.isf(1e-6, POSE))  # squared distance from odometry in its sigmas
+IMPOSSIBLE = float(exceeded_by(1e-6, POSE))  # squared distance from odometry in its sigmas
 LEAST, MOST = 20, 1500  # key poses that are solved as a whole; a round of 350 takes two seconds
 PIECE = 20  # key poses that are followed anew while one comes
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from l2m_gtsam.solve.chi_square import chance_beyond, density, quantile
+from l2m_gtsam.solve.chi_square import chance_beyond, density, exceeded_by, quantile
 
 SHARES = np.array([0.0, 1e-9, 0.5, 0.95, 0.999, 1.0, np.nan])
 VALUES = np.array([-5.0, -1e-12, 0.0, 0.3, 7.81, 80.0, 1e4, np.inf, np.nan])
@@ -14,6 +14,7 @@ VALUES = np.array([-5.0, -1e-12, 0.0, 0.3, 7.81, 80.0, 1e4, np.inf, np.nan])
 def test_quantiles_and_chances(freedom: int) -> None:
     np.testing.assert_allclose(quantile(SHARES, freedom), chi2.ppf(SHARES, freedom), rtol=1e-12)
     np.testing.assert_allclose(chance_beyond(VALUES, freedom), chi2.sf(VALUES, freedom), rtol=1e-12)
+    np.testing.assert_allclose(exceeded_by(SHARES, freedom), chi2.isf(SHARES, freedom), rtol=1e-12)
 
 
 def test_several_freedoms_at_once() -> None:
