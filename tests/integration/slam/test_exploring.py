@@ -63,14 +63,18 @@ def test_laps_take_the_drift_out_while_they_are_driven(round_and_round: OnLine) 
 
 
 def test_poses_are_where_all_solved_together_are(round_and_round: OnLine) -> None:
-    """To 3 cm: tiles are laid anew there, and poses that were let go hang on anchors here."""
+    """To half of their sigmas: both have the same readings, of which none could tell them apart.
+
+    Tiles are laid anew there, and poses that were let go hang on anchors here.
+    """
     drive, options = round_and_round.drive, SlamOptions.model_validate(QUICK)
     begin = drive.dead_reckoning()
     prior = drive_prior(drive, begin, options.tiles)
-    batch = map_drive(drive, begin, prior, options, silent).solution.poses
-    pairs = zip(round_and_round.explorer.poses(), batch, strict=True)
+    batch = map_drive(drive, begin, prior, options, silent).solution
+    sigma = np.sqrt(np.trace(batch.pose_covariance[:, 3:, 3:], axis1=1, axis2=2))
+    pairs = zip(round_and_round.explorer.poses(), batch.poses, strict=True)
     apart = np.array([np.linalg.norm(a.translation() - b.translation()) for a, b in pairs])
-    assert rms(apart) < 0.03
+    assert rms(apart) < 0.5 * rms(sigma)
 
 
 def test_what_is_remembered_grows_with_the_place_alone(round_and_round: OnLine) -> None:
@@ -123,8 +127,11 @@ def test_where_nothing_is_read_odometry_carries_on() -> None:
     readings = replace(drive.readings, field=drive.readings.field + spiked)
     kept = np.flatnonzero((at < 36) | (at > 60))
     found = OnLine.over(replace(drive, readings=readings[kept]), truth, options, ExploringOptions())
-    sigma = [np.sqrt(np.trace(belief.pose_covariance[3:, 3:])) for belief in found.beliefs]
-    assert sigma[60] > 1.3 * sigma[34]  # 7 m more of odometry: by its variance 1.4 times
+    variance = np.array([np.trace(belief.pose_covariance[3:, 3:]) for belief in found.beliefs])
+    steps = drive.as_walk(options.drift.over_m).steps.covariance[:, 3:, 3:]
+    alone = np.trace(steps[36:60], axis1=1, axis2=2).sum()
+    # What odometry adds since the last reading, and a half of what was known before that.
+    assert variance[60] > alone + 0.5 * variance[34]
     assert found.nees().mean() < 12
     drift = found.off(drive.dead_reckoning())
     assert rms(found.off([belief.pose for belief in found.beliefs])) < 1.2 * rms(drift)

@@ -323,8 +323,8 @@ def test_without_a_map_it_is_the_explorer_and_it_resumes() -> None:
             "tiles": {"modes": 60, "learn_over_m": 9.0},
         }
     )
-    sensors = random_sensors(2, 6)
-    recorded = slam_drive(dipole_world(2), sensors, laps(36, (1.9, 1.4)), np.random.default_rng(2))
+    sensors = random_sensors(3, 6)
+    recorded = slam_drive(dipole_world(3), sensors, laps(36, (1.9, 1.4)), np.random.default_rng(3))
     given = list(messages(recorded.recording))
     plain = OnlineSlam(calibrated(sensors), options)
     whole = driven(plain, given)
@@ -337,7 +337,7 @@ def test_without_a_map_it_is_the_explorer_and_it_resumes() -> None:
     assert np.sqrt(np.mean(off[-last:] ** 2)) < 0.5 * np.sqrt(np.mean(drift[-last:] ** 2))
     assert whole.nees(recorded.truth)[1:].mean() < 12
     points, field = explored_field(plain)
-    truth = dipole_world(2).field_and_gradient(points)[0]
+    truth = dipole_world(3).field_and_gradient(points)[0]
     assert np.sqrt(np.mean((field - truth) ** 2)) < 1.0
     for at in (len(given) // 5, 2 * len(given) // 3):  # before the field is learnt, and after
         slam = OnlineSlam(calibrated(sensors), options)
@@ -359,7 +359,7 @@ def test_refined_calibrations_are_handed_out_with_what_is_known_of_them_then(
     has_map: bool,
 ) -> None:
     """Not with the covariances that they had before the drive."""
-    sensors, off = random_sensors(2, 3), np.repeat([5e-3, 5e-3, 0.3], [3, 9, 3])
+    sensors, off = random_sensors(3, 3), np.repeat([5e-3, 5e-3, 0.3], [3, 9, 3])
     known = calibrated(sensors, sigma=off, rng=np.random.default_rng(5))
     options = SlamOptions.model_validate(
         {
@@ -368,8 +368,8 @@ def test_refined_calibrations_are_handed_out_with_what_is_known_of_them_then(
             "tiles": {"modes": 50, "learn_over_m": 5.0},
         }
     )
-    world = dipole_world(2)
-    recorded = slam_drive(world, sensors, laps(25, (1.9, 1.4)), np.random.default_rng(2))
+    world = dipole_world(3)
+    recorded = slam_drive(world, sensors, laps(25, (1.9, 1.4)), np.random.default_rng(3))
     slam = OnlineSlam(known, options, world if has_map else None)
     last = driven(slam, messages(recorded.recording)).poses[-1]
     assert isinstance(slam.estimator, Explorer | Follower)
