@@ -202,6 +202,7 @@ def expected_deviation(value: FloatArray, sigma: FloatArray) -> FloatArray:
     """
     # Of N normal values the median has pi / 2 times the variance of the mean.
     of_median = MEDIAN * np.median(sigma) ** 2 / len(value)
+    # As scipy.stats.median_abs_deviation, which takes half a second to load.
     spread = float(np.median(np.abs(value - np.median(value))) / ndtri(0.75))
     smallest = np.finfo(float).tiny  # values that are exact and all alike
     return np.asarray(np.maximum(np.sqrt(sigma**2 + of_median), max(spread, smallest)))

@@ -93,8 +93,11 @@ def test_the_first_bar_comes_before_all_that_is_heavy(
     assert loaded[command] == []
 
 
-def test_a_calibration_loads_no_statistics_and_no_other_peers() -> None:
+def test_calibrations_and_slam_load_no_statistics_and_no_other_peers() -> None:
     """They take half a second for a quantile, or are for studies only."""
     loaded = "[each for each in ('scipy.stats', 'sklearn', 'dask') if each in sys.modules]"
-    needed = "import json, sys, l2m_gtsam.batch.drives, l2m_gtsam.batch.reports"
+    modules = ", ".join(
+        f"l2m_gtsam.batch.{each}" for each in ("drives", "fleet", "online_slam", "reports", "slam")
+    )
+    needed = f"import json, sys, {modules}"
     assert said(f"{needed}; print(json.dumps({loaded}))") == [[]]
