@@ -1,6 +1,6 @@
 """Tiles: how large they are, where they lie, and how they blend."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -59,6 +59,10 @@ class Resolution:
         return Resolution(min(self.floor, most), min(self.ceiling, most))
 
 
+# Makes a resolution coarser until the smallest tile has so many modes at most.
+Coarsening = Callable[[Resolution, TilingOptions, int], Resolution]
+
+
 def resolution_of(hyperparameters: Hyperparameters, density: float, share: float) -> Resolution:
     """Return which modes readings of a density carry information on.
 
@@ -111,9 +115,18 @@ def affordable(resolution: Resolution, options: TilingOptions, budget: int) -> R
 
     What is left out counts as variance.
     """
-    smallest = LEAST_CORE + 2 * (options.overlap + options.margin)
-    over = np.sqrt(max(resolution.modes(smallest) / budget, 1.0))
+    over = np.sqrt(max(resolution.modes(smallest_edge(options)) / budget, 1.0))
     return Resolution(float(resolution.floor / over), float(resolution.ceiling / over))
+
+
+def evenly_affordable(resolution: Resolution, options: TilingOptions, budget: int) -> Resolution:
+    """Return the same where what is known of both sides is not to be relied upon."""
+    return resolution.evenly_within(budget, smallest_edge(options))
+
+
+def smallest_edge(options: TilingOptions) -> float:
+    """Return the edge of the box of the smallest tile in metres."""
+    return LEAST_CORE + 2 * (options.overlap + options.margin)
 
 
 def surveyed_area(points: FloatArray) -> float:

@@ -16,7 +16,12 @@ from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
-from l2m_gtsam.maps.harmonic.tiling import Resolution, resolution_of, surveyed_area
+from l2m_gtsam.maps.harmonic.tiling import (
+    Resolution,
+    evenly_affordable,
+    resolution_of,
+    surveyed_area,
+)
 from l2m_gtsam.maps.training import merged, training_set
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
@@ -76,7 +81,8 @@ def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> 
     if hyperparameters is None:
         learning = LearningOptions(modes=options.modes)
         tiling, share = defaults.tiling, defaults.mode_share
-        hyperparameters = learn(readings, NO_SOURCES, tiling, share, learning).hyperparameters
+        learnt = learn(readings, NO_SOURCES, tiling, share, learning, evenly_affordable)
+        hyperparameters = learnt.hyperparameters
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
     wanted = resolution_of(hyperparameters, density, defaults.mode_share)
     kept = wanted.evenly_within(options.modes, options.edge)
