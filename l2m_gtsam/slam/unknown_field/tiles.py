@@ -33,6 +33,10 @@ from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 # square of this factor; the loss is small, for readings are dense along the path.
 WIDER = 10.0
 
+# At least so many waves in a window that the prior is learnt from, fewer as tiles may have: with 100
+# sources came out within 3 to 10 cm of the sensors where they are 40 cm away.
+LEARNING_MODES = 200
+
 GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
 
 
@@ -79,7 +83,7 @@ def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> 
     readings = merged(training_set(points, field), defaults.merge, defaults.independent)
     hyperparameters = options.hyperparameters
     if hyperparameters is None:
-        learning = LearningOptions(modes=options.modes)
+        learning = LearningOptions(modes=max(options.modes, LEARNING_MODES))
         tiling, share = defaults.tiling, defaults.mode_share
         learnt = learn(readings, NO_SOURCES, tiling, share, learning, evenly_affordable)
         hyperparameters = learnt.hyperparameters

@@ -10,15 +10,18 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
-from l2m_gtsam.slam.options import TileOptions
+from l2m_gtsam.slam.localisation import prepared
+from l2m_gtsam.slam.options import SlamOptions, TileOptions
 from l2m_gtsam.slam.unknown_field.tiles import (
     Anchoring,
     FieldPrior,
     WaveTile,
     anchor_tiles,
+    drive_prior,
     field_prior,
 )
-from tests.worlds.exact import dipole_world
+from tests.drives.slam import calibrated, laps, slam_drive
+from tests.worlds.exact import dipole_world, random_sensors
 
 OPTIONS = TileOptions(core=3.0, modes=150)
 PRIOR = FieldPrior(Hyperparameters(), Resolution(4.0, 3.0), OPTIONS)
@@ -125,6 +128,25 @@ def test_waves_stay_within_their_number() -> None:
 def test_a_prior_is_not_learnt_from_nothing() -> None:
     with pytest.raises(MapError, match="training readings"):
         field_prior(np.zeros((3, 3)), np.ones((3, 3)), OPTIONS)
+
+
+def test_few_waves_teach_of_the_sources_what_many_do() -> None:
+    """Along odometry in a hall of which windows of 200 waves hold a part.
+
+    With the same factor for floor and ceiling strength came out 1.6 times as large.
+    """
+    own = random_sensors(11, 4)
+    driven = slam_drive(dipole_world(11), own, laps(25.0, (1.9, 1.4)), np.random.default_rng(11))
+    frequent = SlamOptions.model_validate({"key_poses": {"distance_m": 0.1, "readings": 2}})
+    drive, _ = prepared(driven.recording, calibrated(own), frequent)
+    few, many = (
+        drive_prior(drive, drive.dead_reckoning(), TileOptions(modes=modes)).hyperparameters
+        for modes in (200, 450)
+    )
+    # A fifth is a third of what strength was off by with the same factor.
+    assert few.floor_scale == pytest.approx(many.floor_scale, rel=0.2)
+    assert few.floor_depth == pytest.approx(many.floor_depth, rel=0.2)
+    assert few.noise == pytest.approx(many.noise, rel=0.2)
 
 
 def test_a_side_too_weak_for_any_wave_is_left_out() -> None:
