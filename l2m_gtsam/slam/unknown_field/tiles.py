@@ -33,8 +33,8 @@ from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 # square of this factor; the loss is small, for readings are dense along the path.
 WIDER = 10.0
 
-# At least so many waves in a window that the prior is learnt from, fewer as tiles may have: with 100
-# sources came out within 3 to 10 cm of the sensors where they are 40 cm away.
+# The least waves of a window that the prior is learnt from, even where tiles have fewer: with 100,
+# sources 40 cm away came out at 3 to 10 cm.
 LEARNING_MODES = 200
 
 GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
