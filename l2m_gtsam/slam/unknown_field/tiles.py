@@ -33,10 +33,6 @@ from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 # square of this factor; the loss is small, for readings are dense along the path.
 WIDER = 10.0
 
-# The least waves of a window that the prior is learnt from, even where tiles have fewer: with 100,
-# sources 40 cm away came out at 3 to 10 cm.
-LEARNING_MODES = 200
-
 GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
 
 
@@ -83,7 +79,7 @@ def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> 
     readings = merged(training_set(points, field), defaults.merge, defaults.independent)
     hyperparameters = options.hyperparameters
     if hyperparameters is None:
-        learning = LearningOptions(modes=max(options.modes, LEARNING_MODES))
+        learning = LearningOptions(modes=options.modes)
         tiling, share = defaults.tiling, defaults.mode_share
         learnt = learn(readings, NO_SOURCES, tiling, share, learning, evenly_affordable)
         hyperparameters = learnt.hyperparameters

@@ -135,8 +135,9 @@ def test_a_calibration_is_refined_without_a_map() -> None:
     sensors, drive = drive_in(3, laps(60))
     sigma = np.concatenate([np.full(3, 0.05), np.full(9, 0.01), np.full(3, 1.0)])
     rough = calibrated(sensors, sigma=sigma, rng=np.random.default_rng(5))
-    # Tiles that are a little larger than by default: fewer, in less than half the time.
-    chosen = {"key_poses": COARSE, "calibration": "refined", "tiles": {"core": 4.0, "modes": 100}}
+    # Tiles that are larger than by default, of as many waves: fewer, in less time. With 100 waves
+    # no gain is shown (odometry is nearer with a probability of 7 %).
+    chosen = {"key_poses": COARSE, "calibration": "refined", "tiles": {"core": 4.0}}
     options = SlamOptions.model_validate(chosen)
     found = explore(drive.recording, rough, options, silent).result
     assert found.calibration is not None
