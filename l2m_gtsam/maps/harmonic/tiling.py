@@ -120,7 +120,7 @@ def affordable(resolution: Resolution, options: TilingOptions, budget: int) -> R
 
 
 def evenly_affordable(resolution: Resolution, options: TilingOptions, budget: int) -> Resolution:
-    """Return the same where what is known of both sides is not to be relied upon."""
+    """Return it within the same budget, the shortest waves left out of whichever side."""
     return resolution.evenly_within(budget, smallest_edge(options))
 
 
