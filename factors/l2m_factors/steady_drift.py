@@ -36,7 +36,7 @@ def drifting_step(key_pose: int, step: gtsam.Pose3, weights: FloatArray) -> Resi
         The next key pose in its frame, with the drift.
     weights
         Metres that one unit of the drift with time, and of that with distance, adds to the step,
-        shape (2,).
+        shape (2,); or along each axis of the frame of the poses, shape (2, 3).
     """
     R, W = step.rotation(), drift_weights(weights)
 
@@ -82,5 +82,12 @@ def drifting_fixed_axes_step(
 
 
 def drift_weights(weights: FloatArray) -> FloatArray:
-    """Return W, what a unit of each component of the drift adds to a step in m, shape (3, 6)."""
-    return np.hstack([each * np.eye(3) for each in weights])
+    """Return W, what a unit of each component of the drift adds to a step in m, shape (3, 6).
+
+    Parameters
+    ----------
+    weights
+        As of ``drifting_step``.
+    """
+    along_axes = np.broadcast_to(np.reshape(weights, (2, -1)), (2, 3))
+    return np.hstack([np.diag(each) for each in along_axes])

@@ -183,7 +183,7 @@ class Drive:
         """
         if drift is None or self.steps.steady is None:
             return self
-        added = self.steps.steady @ drift.reshape(2, 3)
+        added = np.einsum("nij,ij->nj", self.steps.steady, drift.reshape(2, 3))
         R = np.stack([pose.rotation().matrix() for pose in poses[:-1]])
         own, fixed = np.einsum("nji,nj->ni", R, added), self.steps.fixed_axes
         if fixed is not None:

@@ -5,7 +5,7 @@ Where a recording states covariances of its poses that accumulate as odometry's 
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -59,8 +59,11 @@ class OdometrySteps:
         Steps along the axes of the first key pose in metres, shape (K - 1, 3), where odometry knows
         them along fixed axes; None where it knows them along those of the vehicle.
     steady
-        What one standard deviation of a steady drift adds to each step, metres, shape (K - 1, 2):
-        of the drift that comes with time, and of that with distance. None for none.
+        What one standard deviation of a steady drift adds to each step along the axes of the frame
+        of the poses, metres, shape (K - 1, 2, 3): of the drift that comes with time, and of that
+        with distance. None for none.
+    up_start
+        The third axis of the frame of the poses, in the frame of the first key pose, shape (3,).
     """
 
     R: FloatArray
@@ -70,6 +73,7 @@ class OdometrySteps:
     scale: float = 0.0
     fixed_axes: FloatArray | None = None
     steady: FloatArray | None = None
+    up_start: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     def __len__(self) -> int:
         return len(self.p)
@@ -82,6 +86,14 @@ class OdometrySteps:
             axes.append(axes[-1] @ turn)
         own = np.stack(axes)
         return np.asarray(own[1:] @ own[:-1].transpose(0, 2, 1))
+
+    @property
+    def up(self) -> FloatArray:
+        """The third axis of the frame of the poses, in that of each step's end, (K - 1, 3)."""
+        axes = [self.up_start]
+        for turn in self.R:
+            axes.append(turn.T @ axes[-1])
+        return np.reshape(axes[1:], (-1, 3))
 
     @property
     def path(self) -> FloatArray:
@@ -112,9 +124,11 @@ class OdometrySteps:
         length = np.linalg.norm(self.p, axis=1)
         # Per metre at the drive's mean speed, both kinds together.
         total = float(length.sum())
-        share = np.hypot(*walked.steady.sum(axis=0)) / total if total else 0.0
+        share = np.hypot(*walked.steady.sum(axis=0)) / total if total else np.zeros(3)
+        along, _, vertical = share**2
+        shape = stretched(self.up, vertical / along if along else 1.0)
         covariance = walked.covariance.copy()
-        covariance[:, 3:, 3:] += (share**2 * over_m * length)[:, None, None] * np.eye(3)
+        covariance[:, 3:, 3:] += (along * over_m * length)[:, None, None] * shape
         return replace(walked, covariance=covariance, steady=None)
 
     def with_scale_as_drift(self, over_m: float) -> "OdometrySteps":
@@ -183,7 +197,7 @@ def odometry_steps(
     if stated is not None:  # the repair of jumps has put their covariance into the poses'
         covariance = stated + isotropic_covariance(options.least_deg, options.least_m)
     else:
-        covariance = drift_covariance(R, p, options)
+        covariance = drift_covariance(R, p, options, trajectory.R[rows[1:], 2])
         for jump in jumps:
             covariance[np.searchsorted(rows, jump.row)] += jump.covariance
     seconds = 1e-9 * np.diff(trajectory.stamp_ns[rows])
@@ -195,35 +209,39 @@ def odometry_steps(
         stated=stated is not None,
         scale=options.scale,
         fixed_axes=fixed,
-        steady=steady_weights(seconds, p, share) if share else None,
+        steady=steady_weights(seconds, p, share) if share.any() else None,
+        up_start=trajectory.R[rows[0], 2],
     )
 
 
-def steady_share(options: DriftOptions, *, is_stated: bool) -> float:
-    """Return a steady drift's standard deviation as a share of the distance; 0 for none.
+def steady_share(options: DriftOptions, *, is_stated: bool) -> FloatArray:
+    """Return a steady drift's standard deviation along each axis as a share of the distance, (3,).
 
-    Covariances that a recording states have what they share already.
+    None if all are 0. Covariances that a recording states have what they share already.
     """
     if options.scale:
-        return 0.0
-    if options.steady is None:
-        return 0.0 if is_stated else options.position_share
-    return options.steady
+        return np.zeros(3)
+    share = options.steady
+    if share is None:
+        share = 0.0 if is_stated else options.position_share
+    return share * np.array([1.0, 1.0, options.of_height])
 
 
-def steady_weights(seconds: FloatArray, p: FloatArray, share: float) -> FloatArray:
-    """Return what a steady drift by a share of the distance adds to N steps, m, shape (N, 2).
+def steady_weights(seconds: FloatArray, p: FloatArray, share: FloatArray) -> FloatArray:
+    """Return what a steady drift by a share of the distance adds to N steps, m, shape (N, 2, 3).
 
     Parameters
     ----------
     seconds, p
         Times and steps, shapes (N,) and (N, 3), metres.
     share
-        Standard deviation after the whole drive, half of its variance with time.
+        Standard deviation along each axis after the whole drive, half of its variance with time,
+        shape (3,).
     """
     length = np.linalg.norm(p, axis=1)
     speed = length.sum() / seconds.sum() if len(seconds) else 0.0
-    return np.asarray(np.sqrt(0.5) * share * np.column_stack([speed * seconds, length]))
+    both = np.column_stack([speed * seconds, length])
+    return np.asarray(np.sqrt(0.5) * both[:, :, None] * share)
 
 
 def _stated(
@@ -242,7 +260,9 @@ def _stated(
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ vectors.swapaxes(1, 2))
 
 
-def drift_covariance(R: FloatArray, p: FloatArray, options: DriftOptions) -> FloatArray:
+def drift_covariance(
+    R: FloatArray, p: FloatArray, options: DriftOptions, up: FloatArray | None = None
+) -> FloatArray:
     """Return covariances of N steps that grow with their length and rotation, shape (N, 6, 6).
 
     Parameters
@@ -251,6 +271,9 @@ def drift_covariance(R: FloatArray, p: FloatArray, options: DriftOptions) -> Flo
         The steps, shapes (N, 3, 3) and (N, 3), metres.
     options
         Drift of odometry.
+    up
+        The third axis of the frame of the poses, in that of each step's end, shape (N, 3). Where it
+        is not known, heights and tilts drift as all else does.
     """
     length, turn = np.linalg.norm(p, axis=1), turn_angle(R)
     # Steps err independently: variances add up to (share * over_m)^2 after over_m metres.
@@ -258,10 +281,27 @@ def drift_covariance(R: FloatArray, p: FloatArray, options: DriftOptions) -> Flo
     position = options.position_share**2 * over
     rotation = np.deg2rad(options.rotation_deg_per_m) ** 2 * over
     rotation += (options.rotation_share * turn) ** 2
-    variance = np.repeat(np.column_stack([rotation, position]), 3, axis=1)
-    return np.asarray(
-        variance[:, :, None] * np.eye(6) + isotropic_covariance(options.least_deg, options.least_m)
-    )
+    covariance = np.zeros((len(p), 6, 6))
+    covariance[:, :3, :3] = rotation[:, None, None] * np.eye(3)
+    covariance[:, 3:, 3:] = position[:, None, None] * np.eye(3)
+    if up is not None:
+        level = np.eye(3) - up[:, :, None] * up[:, None]
+        covariance[:, :3, :3] += (rotation * (options.of_tilt**2 - 1))[:, None, None] * level
+        covariance[:, 3:, 3:] = position[:, None, None] * stretched(up, options.of_height**2)
+    return np.asarray(covariance + isotropic_covariance(options.least_deg, options.least_m))
+
+
+def stretched(axes: FloatArray, ratio: float) -> FloatArray:
+    """Return unit variances that are other by a ratio along one axis each, shape (N, 3, 3).
+
+    Parameters
+    ----------
+    axes
+        Unit vectors, shape (N, 3).
+    ratio
+        Of variances.
+    """
+    return np.asarray(np.eye(3) + (ratio - 1) * axes[:, :, None] * axes[:, None])
 
 
 def scan_odometry(
@@ -290,7 +330,8 @@ def scan_odometry(
         pose = interpolated(near, at)
         here = RigidTransform(pose.R[0], pose.p[0])
         step = IDENTITY if last is None else between(last, here)
-        covariance = drift_covariance(step.R[None], step.t[None], options.drift)[0]
+        up = here.R[2][None]
+        covariance = drift_covariance(step.R[None], step.t[None], options.drift, up)[0]
         if last is not None:
             covariance += _jumps_between(repaired, last_ns, scan.stamp_ns)
         surface = Surface(taken_at_once(scan, twists(near, at)[0]), edge)

@@ -138,6 +138,13 @@ class DriftOptions(Options):
     """Standard deviation of the rotation about each axis, in degrees per metre,"""
     rotation_share: float = Field(default=0.01, ge=0, lt=1)
     """and as a share of the turning itself."""
+    height_share: float | None = Field(default=None, ge=0, lt=1)
+    """Standard deviation of the height, along the third axis of the frame of the poses, in place of
+    `position_share` (and of `steady`, in the same ratio): 0 for wheels on an even floor."""
+    tilt_deg_per_m: float | None = Field(default=None, ge=0)
+    """Standard deviation of roll and pitch, about axes across the third axis of the frame of the
+    poses, in place of `rotation_deg_per_m` (and of `rotation_share`, in the same ratio): 0 where an
+    even floor or gravity holds them."""
     over_m: float = Field(default=10.0, gt=0)
     """The distance over which these hold."""
     scale: float = Field(default=0.0, ge=0, lt=1)
@@ -161,6 +168,16 @@ class DriftOptions(Options):
     """No step is known better than this,"""
     least_deg: float = Field(default=0.02, gt=0)
     """nor than this in rotation. Both are also added to what a recording states."""
+
+    @property
+    def of_height(self) -> float:
+        """Ratio of the height's standard deviation to that along a level axis."""
+        return 1.0 if self.height_share is None else self.height_share / self.position_share
+
+    @property
+    def of_tilt(self) -> float:
+        """Ratio of the tilts' standard deviation to that of the heading."""
+        return 1.0 if self.tilt_deg_per_m is None else self.tilt_deg_per_m / self.rotation_deg_per_m
 
     @model_validator(mode="after")
     def _scale_along_the_vehicle(self) -> "DriftOptions":

@@ -198,9 +198,9 @@ def _moved_by_drift(drive: Drive, poses: list[gtsam.Pose3]) -> FloatArray:
     moved_by = np.zeros((len(poses), 6, 6))
     if drive.steps.steady is not None:
         R_back = np.stack([each.rotation().matrix().T for each in poses])
-        sums = np.vstack([np.zeros(2), np.cumsum(drive.steps.steady, axis=0)])
-        moved_by[:, 3:, :3] = sums[:, :1, None] * R_back
-        moved_by[:, 3:, 3:] = sums[:, 1:, None] * R_back
+        sums = np.vstack([np.zeros((1, 2, 3)), np.cumsum(drive.steps.steady, axis=0)])
+        moved_by[:, 3:, :3] = R_back * sums[:, :1]
+        moved_by[:, 3:, 3:] = R_back * sums[:, 1:]
     return moved_by
 
 

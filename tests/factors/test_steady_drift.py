@@ -27,7 +27,8 @@ def drawn(seed: int) -> tuple[gtsam.Pose3, FloatArray, gtsam.Values]:
     values.insert(X(4), first)
     values.insert(X(5), first.compose(step).retract(rng.normal(0, 0.2, 6)))
     values.insert(V(), rng.normal(size=6))
-    return step, rng.uniform(0.0, 0.3, 2), values
+    shape = (2, 3) if seed % 2 else (2,)  # along each axis, or the same along all
+    return step, rng.uniform(0.0, 0.3, shape), values
 
 
 @given(seed=st.integers(0, 10_000))

@@ -80,10 +80,14 @@ class Intake:
         Calibrated sensors.
     options
         Of a localisation.
+    steady
+        Whether the estimator knows a steady drift of odometry; for others it is part of each step's
+        own error.
     """
 
-    def __init__(self, sensors: KnownSensors, options: SlamOptions) -> None:
+    def __init__(self, sensors: KnownSensors, options: SlamOptions, *, steady: bool) -> None:
         self._known, self._options, self._online = sensors, options, options.online
+        self._steady = steady
         self._index = {name: i for i, name in enumerate(sensors.names)}
         self.state = IntakeState(sensors=[SensorBuffer() for _ in sensors.names])
         self._looked_at = 1
@@ -265,7 +269,11 @@ class Intake:
         options = self._options
         readings = self._placed(waiting, trajectory, rows)
         steps = odometry_steps(trajectory, rows, options.drift)
-        steps = steps.with_scale_as_drift(options.drift.over_m)
+        share = steady_share(options.drift, is_stated=steps.stated)
+        if self._steady:
+            steps = steps.with_scale_as_drift(options.drift.over_m)
+        else:
+            steps, share = steps.as_walk(options.drift.over_m), np.zeros(3)
         of_key_pose = key_pose_readings(readings, trajectory, rows)
         return ArrivedKeyPose(
             number,
@@ -277,7 +285,7 @@ class Intake:
             readings.stamp_ns,
             Links.none(),
             fixed=self._fixed(poses[0].T, poses[row].T),
-            steady=steady_share(options.drift, is_stated=steps.stated),
+            steady=share,
         )
 
     def _fixed(self, before: RigidTransform, after: RigidTransform) -> FixedStep | None:

@@ -5,7 +5,7 @@ drives (:mod:`.intake`). Readings between two key poses come with the second of 
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -64,7 +64,8 @@ class ArrivedKeyPose:
     fixed
         The step along fixed axes, where odometry knows it so.
     steady
-        Standard deviation of odometry's steady drift as a share of the distance; 0 for none.
+        Standard deviation of odometry's steady drift along each axis as a share of the distance,
+        shape (3,); zeros for none.
     recorded
         The same key pose by the step that odometry recorded, where this one goes on with the motion
         before, for the recorded step is far from it.
@@ -81,7 +82,7 @@ class ArrivedKeyPose:
     lost: bool = False
     scans: tuple[ScanAtKeyPose, ...] = ()
     fixed: FixedStep | None = None
-    steady: float = 0.0
+    steady: FloatArray = field(default_factory=lambda: np.zeros(3))
     recorded: "ArrivedKeyPose | None" = None
 
     @property
@@ -96,25 +97,18 @@ class ArrivedKeyPose:
 
     @property
     def steady_m(self) -> FloatArray:
-        """What one standard deviation of the drift adds to the step, with time and distance, (2,).
+        """What one standard deviation of the drift adds, with time and with distance, (2, 3).
 
         All of it comes with distance: with half of it by time the errors on a model ship are the
         same, and the mean speed is not known yet.
         """
-        return np.array([0.0, self.steady * self.length_m])
+        return np.stack([np.zeros(3), self.steady * self.length_m])
 
     def without_readings(self) -> "ArrivedKeyPose":
         """Return it by odometry alone."""
         recorded = None if self.recorded is None else self.recorded.without_readings()
         none = np.empty(0, dtype=np.int64)
         return replace(self, readings=no_readings(), reading_ns=none, recorded=recorded)
-
-    def as_walk(self, over_m: float) -> "ArrivedKeyPose":
-        """Return it for estimators without a steady drift; see ``OdometrySteps.as_walk``."""
-        covariance = self.covariance.copy()
-        covariance[3:, 3:] += self.steady**2 * over_m * self.length_m * np.eye(3)
-        recorded = None if self.recorded is None else self.recorded.as_walk(over_m)
-        return replace(self, covariance=covariance, steady=0.0, recorded=recorded)
 
     @classmethod
     def first(cls, stamp_ns: int, links: Links) -> "ArrivedKeyPose":
@@ -155,7 +149,7 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
     """Return key poses, from the first on, as a drive."""
     steps = key_poses[1:]
     shifts = [each.fixed.shift for each in steps if each.fixed is not None]
-    steady = np.reshape([each.steady_m for each in steps], (-1, 2))
+    steady = np.reshape([each.steady_m for each in steps], (-1, 2, 3))
     return Drive(
         stamp_ns=np.array([each.stamp_ns for each in key_poses], dtype=np.int64),
         steps=OdometrySteps(
@@ -165,6 +159,7 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
             stated=False,
             fixed_axes=np.stack(shifts) if shifts and len(shifts) == len(steps) else None,
             steady=steady if steady.any() else None,
+            up_start=start.T_map_lidar.R[2],
         ),
         readings=joined_readings([each.readings for each in key_poses]),
         start=start,

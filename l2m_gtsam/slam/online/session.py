@@ -138,7 +138,7 @@ class OnlineSlam:
         self.options, self.sensors = options, known_sensors(usable)
         self._map = None if field_map is None else for_solvers(field_map)
         self.matcher = matcher
-        self.intake = Intake(self.sensors, options)
+        self.intake = Intake(self.sensors, options, steady=self._one_field)
         self.estimator: Follower | Explorer | OneFieldExplorer | None = None
         self.search: StartSearchState | None = None
         self.base, self.stamp_ns = 0, 0  # number of the first key pose, time of the last
@@ -196,8 +196,6 @@ class OnlineSlam:
         for key_pose in self.intake.key_poses(to_the_end=to_the_end):
             if self.estimator is None and self.search is None:
                 self._begin()
-            if not isinstance(self.estimator, OneFieldExplorer):
-                key_pose = key_pose.as_walk(self.options.drift.over_m)
             yield from self._added(renumbered(key_pose, self.base))
 
     def _begin(self) -> None:

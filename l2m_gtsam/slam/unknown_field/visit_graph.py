@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from l2m_factors import drift_weights
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.odometry import OdometrySteps
 from l2m_gtsam.slam.options import DriftOptions
@@ -33,7 +34,8 @@ class Way:
     covariance
         Of a right perturbation of it, shape (6, 6).
     steady
-        Metres that one unit of the drifts with time and with distance adds, shape (2,).
+        Metres that one unit of the drifts with time and with distance adds along each axis of the
+        frame of the poses, shape (2, 3).
     """
 
     T: gtsam.Pose3
@@ -49,7 +51,7 @@ class Way:
             carried = step.inverse().AdjointMap()
             covariance = carried @ covariance @ carried.T + steps.covariance[k]
             T = T.compose(step)
-        steady = np.zeros(2) if steps.steady is None else steps.steady[first:last].sum(axis=0)
+        steady = np.zeros((2, 3)) if steps.steady is None else steps.steady[first:last].sum(axis=0)
         return cls(T, covariance, steady)
 
 
@@ -112,7 +114,7 @@ class VisitGraph:
         rows, by = self.relative(number, number + 1)
         drift = np.zeros((POSE, DRIFT))
         R = self.nodes[number + 1].rotation().matrix()
-        drift[3:] = R.T @ np.kron(way.steady, np.eye(3))
+        drift[3:] = R.T @ drift_weights(way.steady)
         size = POSE * len(self.nodes)
         return np.append(rows, size + np.arange(DRIFT)), np.hstack([by, drift])
 

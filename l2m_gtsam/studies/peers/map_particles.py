@@ -63,7 +63,7 @@ def map_particles(
     back = odometry.R[:-1].transpose(0, 2, 1)
     turns = back @ odometry.R[1:]
     steps = np.einsum("nij,nj->ni", back, np.diff(odometry.p, axis=0))
-    covariance = drift_covariance(turns, steps, drift)
+    covariance = drift_covariance(turns, steps, drift, odometry.R[1:, 2])
     roots = np.linalg.cholesky(covariance)
     p = np.tile(odometry.p[0], (count, 1))
     R = np.tile(odometry.R[0], (count, 1, 1))

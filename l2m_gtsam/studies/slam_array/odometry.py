@@ -10,20 +10,32 @@ from l2m_gtsam.slam.odometry import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 
 TURN_RAD = np.deg2rad(0.05)  # of a heading after a metre
+SHARE = 0.01  # of the path, that the position is wrong by
 
 
-def slipping(truth: Trajectory, rng: np.random.Generator, share: float = 0.01) -> Trajectory:
-    """Return odometry that slips one way, and whose heading wanders a little.
+def slipping(truth: Trajectory, rng: np.random.Generator, share: float = SHARE) -> Trajectory:
+    """Return odometry that slips one way, a tenth of it upwards, and whose turns wander a little.
 
-    ``share`` is what the position is wrong by, of the path: a slip along one line of the map, which
-    does not cancel when the vehicle comes back as a wrong scale does.
+    The slip is a share of the path along one line of the map, and does not cancel when the vehicle
+    comes back as a wrong scale does.
     """
+    return _slipped(truth, rng, share * np.array([1.0, 1.0, 0.1]), np.ones(3))
+
+
+def slipping_on_floor(truth: Trajectory, rng: np.random.Generator) -> Trajectory:
+    """Return the same of wheels on an even floor: in x, y and heading alone."""
+    return _slipped(truth, rng, SHARE * np.array([1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+
+
+def _slipped(
+    truth: Trajectory, rng: np.random.Generator, share: FloatArray, about: FloatArray
+) -> Trajectory:
     turns, steps = _steps(truth)
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     heading = rng.uniform(-np.pi, np.pi)
-    slip = share * length * np.array([np.cos(heading), np.sin(heading), 0.1])
+    slip = share * length * np.array([np.cos(heading), np.sin(heading), 1.0])
     turn = Rotation.from_matrix(turns).as_rotvec()
-    turn = turn + TURN_RAD * np.sqrt(length) * rng.normal(size=turn.shape)
+    turn = turn + TURN_RAD * np.sqrt(length) * about * rng.normal(size=turn.shape)
     R, p = [truth.R[0]], [truth.p[0]]
     for own, step, off in zip(Rotation.from_rotvec(turn).as_matrix(), steps, slip, strict=True):
         p.append(p[-1] + R[-1] @ step + off)

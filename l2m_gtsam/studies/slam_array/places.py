@@ -34,7 +34,7 @@ from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.slam.methods import given_sensors
 from l2m_gtsam.studies.slam.recordings import ROBOT, readable
-from l2m_gtsam.studies.slam_array.odometry import slipping, walked
+from l2m_gtsam.studies.slam_array.odometry import slipping, slipping_on_floor, walked
 from l2m_gtsam.studies.slam_array.robot import RUNS, other_passes, robot_pass
 
 ARRAY = "array30_simulated_10runs.npz"
@@ -43,7 +43,15 @@ MAPPED = range(5)  # runs of the array that make its map
 PERIOD_NS = 10_000_000  # of the array
 EVERY = 5  # of the robot's and the array's poses: 10 and 20 a second
 WALK_M = 0.06  # of simulated odometry's random walk, along each axis after a metre
-SCALE = {"stated": "ignored", "scale": 0.01, "position_share": 0.0032, "rotation_deg_per_m": 0.016}
+FLOOR = {"height_share": 0.0, "tilt_deg_per_m": 0.0}
+# Of simulated odometry, whose roll and pitch gravity holds.
+SCALE = {
+    "stated": "ignored",
+    "scale": 0.01,
+    "position_share": 0.0032,
+    "rotation_deg_per_m": 0.016,
+    "tilt_deg_per_m": 0.0,
+}
 
 
 class Drift(StrEnum):
@@ -51,6 +59,13 @@ class Drift(StrEnum):
 
     SLIP = "slip"
     WALK = "walk"
+
+
+# A heading that wanders by 0.05 degrees after a metre wanders by 0.16 after ten.
+WHEELS: dict[Drift, dict[str, object]] = {
+    Drift.SLIP: {"steady": 0.01, "position_share": 0.002, "rotation_deg_per_m": 0.016},
+    Drift.WALK: {"steady": 0.0},
+}
 
 
 @dataclass(frozen=True)
@@ -101,11 +116,12 @@ def robot(folder: Path, run: int) -> DriveInMap:
     if run not in RUNS:
         raise ConfigError(f"{path}: pass {run} is not one of {RUNS[0]} to {RUNS[-1]}")
     others = other_passes(folder, run)
-    options = {"key_poses": {"distance_m": 0.1, "readings": 1}, "calibration": "refined"}
-    chosen = SlamOptions.model_validate(options)
-    return DriveInMap(
-        drive, others.suite, for_solvers(others.field_map), wheels, dict.fromkeys(Drift, chosen)
-    )
+    common = {"key_poses": {"distance_m": 0.1, "readings": 1}, "calibration": "refined"}
+    options = {
+        kind: SlamOptions.model_validate({**common, "drift": {**FLOOR, **own}})
+        for kind, own in WHEELS.items()
+    }
+    return DriveInMap(drive, others.suite, for_solvers(others.field_map), wheels, options)
 
 
 def array(folder: Path, run: int) -> DriveInMap:
@@ -148,7 +164,7 @@ def array(folder: Path, run: int) -> DriveInMap:
         recording,
         given_sensors(known, ARRAY_UT),
         for_solvers(field_map),
-        wheels,
+        carried,
         dict.fromkeys(Drift, options),
     )
 
@@ -195,7 +211,12 @@ def scenario(seed: int, place: dict[str, object]) -> ScenarioOptions:
 
 
 def wheels(truth: Trajectory, drift: Drift, rng: np.random.Generator) -> Trajectory:
-    """Return odometry of wheels."""
+    """Return odometry of wheels on an even floor."""
+    return slipping_on_floor(truth, rng) if drift is Drift.SLIP else walked(truth, rng)
+
+
+def carried(truth: Trajectory, drift: Drift, rng: np.random.Generator) -> Trajectory:
+    """Return odometry of what is carried about."""
     return slipping(truth, rng) if drift is Drift.SLIP else walked(truth, rng)
 
 

@@ -24,11 +24,13 @@ from tests.drives.localised import WORLD, driven, localised, record
 from tests.support.pose_errors import pose_nees, position_error
 
 
-@pytest.mark.parametrize("changes", [{"scale": 0.03, "steady": None}, {}])
+@pytest.mark.parametrize("changes", [{"scale": 0.03, "steady": None}, {}, {"vertical": 0.3}])
 def test_odometry_with_shared_errors_is_as_sure_as_its_graph(changes: dict[str, Any]) -> None:
-    """A scale, or a steady drift."""
+    """A scale, or a steady drift, of which less may be vertical."""
     drive = localised().solution.drive
     assert drive.steps.steady is not None
+    if vertical := changes.pop("vertical", None):
+        changes["steady"] = drive.steps.steady * np.array([1.0, 1.0, vertical])
     drive = replace(drive, steps=replace(drive.steps, **changes))
     values = shared_values(drive)
     for k, pose in enumerate(drive.dead_reckoning()):

@@ -63,6 +63,42 @@ def test_drift_is_its_share_after_the_reference_way_however_it_is_cut(spacing: f
     np.testing.assert_allclose(np.diag(turned), expected, rtol=1e-6)
 
 
+@given(st.integers(0, 1000), st.floats(0, 1), st.floats(0, 1))
+def test_what_is_level_is_so_about_the_vertical(
+    seed: int, of_height: float, of_tilt: float
+) -> None:
+    """However the lidar is mounted: along and about the vertical, and across it.
+
+    Variances are those of all axes alike, times the squares of the ratios.
+    """
+    drive, alike = rounds(5), DriftOptions(least_m=1e-6, least_deg=1e-5)
+    mount = Rotation.random(random_state=seed).as_matrix()
+    tilted, rows = replace(drive, R=drive.R @ mount), np.arange(0, len(drive), 5)
+    plain = odometry_steps(tilted, rows, alike).covariance
+    ratios = {"height_share": 0.01 * of_height, "tilt_deg_per_m": 0.05 * of_tilt}
+    level = odometry_steps(tilted, rows, alike.model_copy(update=ratios)).covariance
+    ratio = np.array([of_tilt, of_tilt, 1.0, 1.0, 1.0, of_height])
+    axes = np.zeros((len(rows) - 1, 6, 6))
+    axes[:, :3, :3] = axes[:, 3:, 3:] = tilted.R[rows[1:]]
+    found, expected = (axes @ each @ axes.transpose(0, 2, 1) for each in (level, plain))
+    # The least that a step errs is a millionth of all, in variance less.
+    np.testing.assert_allclose(found, expected * ratio[:, None] * ratio, atol=1e-9)
+
+
+@given(st.integers(0, 1000), st.floats(0, 0.05))
+def test_a_steady_drift_of_a_level_vehicle_walks_level(seed: int, height_share: float) -> None:
+    """On average over the drive; here along x, whatever way the lidar looks."""
+    drive, share, over = straight(10.0), 0.02, 20.0
+    mount = Rotation.random(random_state=seed).as_matrix()
+    drive = replace(drive, R=drive.R @ mount)
+    options = DriftOptions(position_share=0.01, steady=share, height_share=height_share)
+    steps = odometry_steps(drive, np.arange(0, len(drive), 4), options)
+    more = (steps.as_walk(over).covariance - steps.covariance)[:, 3:, 3:].sum(axis=0)
+    of_height = height_share / 0.01
+    expected = share**2 * over * 10.0 * np.array([1.0, 1.0, of_height**2])
+    np.testing.assert_allclose(mount @ more @ mount.T, np.diag(expected), atol=1e-12)
+
+
 def accumulated(drive: Trajectory, Q: FloatArray) -> Trajectory:
     """Return a drive whose covariances grow by Q at every step."""
     P = [1e-6 * np.eye(6)]
