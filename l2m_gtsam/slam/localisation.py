@@ -21,7 +21,7 @@ from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, odometry_jumps
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import key_pose_links, link_stamps
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
-from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
+from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, plane_notes, with_rows_at
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
@@ -179,7 +179,8 @@ def prepared(
         jumps=odometry_jumps(repaired, rows, options.drift),
     )
     recorded = (note for part in recording.parts for note in part.notes)
-    return drive, (*recorded, *repaired.notes(), *left_out, *masked.notes)
+    plane = () if drive.steps.stated else plane_notes(odometry, options.drift)
+    return drive, (*recorded, *repaired.notes(), *left_out, *masked.notes, *plane)
 
 
 def usable_sensors(

@@ -22,6 +22,11 @@ from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions, SlamOptions, St
 # Rounding and interpolation may make eigenvalues of a step's covariance slightly negative.
 ROUNDING = 1e-6
 NEIGHBOURHOOD_NS = 1_000_000_000  # of odometry before and after a scan, for its motion
+PLANAR = 1e-6  # metres and radians; a lidar or a gyroscope leaves a plane by more
+PLANE = (
+    "odometry never leaves a plane: if the floor is as even, `slam.drift.height_share: 0` and "
+    "`slam.drift.tilt_deg_per_m: 0` say so, and poses become better"
+)
 
 
 @dataclass(frozen=True)
@@ -212,6 +217,16 @@ def odometry_steps(
         steady=steady_weights(seconds, p, share) if share.any() else None,
         up_start=trajectory.R[rows[0], 2],
     )
+
+
+def plane_notes(trajectory: Trajectory, options: DriftOptions) -> tuple[str, ...]:
+    """Return what to say of odometry without heights and tilts, where options let these drift."""
+    if options.height_share is not None or options.tilt_deg_per_m is not None:
+        return ()
+    is_plane = (
+        np.ptp(trajectory.p[:, 2]) <= PLANAR and np.ptp(trajectory.R[:, 2], axis=0).max() <= PLANAR
+    )
+    return (PLANE,) if is_plane else ()
 
 
 def steady_share(options: DriftOptions, *, is_stated: bool) -> FloatArray:

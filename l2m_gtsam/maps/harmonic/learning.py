@@ -17,7 +17,6 @@ from l2m_gtsam.maps.harmonic.representatives import rough_tiles, spread_tiles
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import (
     FINER,
-    Coarsening,
     Resolution,
     Tiling,
     TilingOptions,
@@ -109,7 +108,6 @@ def learn(
     tiling: TilingOptions,
     share: float,
     options: LearningOptions,
-    coarsened: Coarsening = affordable,
 ) -> LearningEnd:
     """Return the hyperparameters that make the readings most likely.
 
@@ -125,20 +123,15 @@ def learn(
         Ratio of variances below which a mode is left out; see ``resolution_of``.
     options
         Number and size of the windows.
-    coarsened
-        Which modes of a window are left out where it would have too many. Each round does it by
-        what the one before has learnt. With few modes, in proportion to what both sides ask for,
-        the side that is taken for the nearer keeps nearly all of them, and what the other's would
-        have held goes to it and to the noise; ``evenly_affordable`` does not depend on that.
     """
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
     guess = starting_point(readings)
     for _ in range(ROUNDS):
-        looked_at = coarsened(resolution_of(guess, density, share), tiling, options.modes)
+        looked_at = affordable(resolution_of(guess, density, share), tiling, options.modes)
         windows = draw_windows(readings, sources, looked_at, tiling, options)
         end = maximise(windows.spread, guess)
         finest = resolution_of(end.hyperparameters, density, share)
-        needed = coarsened(finest, tiling, options.modes)
+        needed = affordable(finest, tiling, options.modes)
         guess = end.hyperparameters
         # Finer modes than those in the windows would have changed their likelihood.
         if needed.floor < FINER * looked_at.floor and needed.ceiling < FINER * looked_at.ceiling:

@@ -1,6 +1,6 @@
 """Tiles: how large they are, where they lie, and how they blend."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -47,20 +47,18 @@ class Resolution:
         """Return about how many modes a square box of this edge in metres has."""
         return MODE_DENSITY * edge**2 * (self.floor**2 + self.ceiling**2)
 
-    def evenly_within(self, modes: float, edge: float) -> "Resolution":
+    def within(self, modes: float, edge: float) -> "Resolution":
         """Return it with the shortest waves left out, of whichever side, down to so many modes.
 
-        Which side's sources are the stronger and the nearer does not count: what is learnt of that
-        from few readings at uncertain places is not to be relied upon.
+        Which side's sources are the stronger and the nearer does not count: with few modes that is
+        not learnt well. If both sides lost in proportion, the side that is taken for the nearer
+        would keep nearly all of its waves, and what the other's would have held would go to it and
+        to the noise, so that the next round takes it for nearer still.
         """
         squares = modes / (MODE_DENSITY * edge**2)
         coarser = min(self.floor, self.ceiling)
         most = float(np.sqrt(max(squares / 2, squares - coarser**2)))
         return Resolution(min(self.floor, most), min(self.ceiling, most))
-
-
-# Makes a resolution coarser until the smallest tile has so many modes at most.
-Coarsening = Callable[[Resolution, TilingOptions, int], Resolution]
 
 
 def resolution_of(hyperparameters: Hyperparameters, density: float, share: float) -> Resolution:
@@ -113,15 +111,9 @@ def finest(needed: Sequence[Resolution]) -> Resolution:
 def affordable(resolution: Resolution, options: TilingOptions, budget: int) -> Resolution:
     """Return the resolution, coarser where the smallest tile would have more modes than allowed.
 
-    What is left out counts as variance.
+    What is left out, the shortest waves of whichever side, counts as variance.
     """
-    over = np.sqrt(max(resolution.modes(smallest_edge(options)) / budget, 1.0))
-    return Resolution(float(resolution.floor / over), float(resolution.ceiling / over))
-
-
-def evenly_affordable(resolution: Resolution, options: TilingOptions, budget: int) -> Resolution:
-    """Return it within the same budget, the shortest waves left out of whichever side."""
-    return resolution.evenly_within(budget, smallest_edge(options))
+    return resolution.within(budget, smallest_edge(options))
 
 
 def smallest_edge(options: TilingOptions) -> float:

@@ -18,7 +18,6 @@ from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
 from l2m_gtsam.maps.harmonic.tiling import (
     Resolution,
-    evenly_affordable,
     resolution_of,
     surveyed_area,
 )
@@ -57,7 +56,7 @@ class FieldPrior:
 
 def coarser(prior: FieldPrior, modes: int) -> FieldPrior:
     """Return a prior whose tiles have so many waves at most."""
-    return replace(prior, resolution=prior.resolution.evenly_within(modes, prior.options.edge))
+    return replace(prior, resolution=prior.resolution.within(modes, prior.options.edge))
 
 
 def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> FieldPrior:
@@ -81,11 +80,11 @@ def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> 
     if hyperparameters is None:
         learning = LearningOptions(modes=options.modes)
         tiling, share = defaults.tiling, defaults.mode_share
-        learnt = learn(readings, NO_SOURCES, tiling, share, learning, evenly_affordable)
+        learnt = learn(readings, NO_SOURCES, tiling, share, learning)
         hyperparameters = learnt.hyperparameters
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
     wanted = resolution_of(hyperparameters, density, defaults.mode_share)
-    kept = wanted.evenly_within(options.modes, options.edge)
+    kept = wanted.within(options.modes, options.edge)
     return FieldPrior(hyperparameters, kept, options)
 
 

@@ -44,12 +44,13 @@ PERIOD_NS = 10_000_000  # of the array
 EVERY = 5  # of the robot's and the array's poses: 10 and 20 a second
 WALK_M = 0.06  # of simulated odometry's random walk, along each axis after a metre
 FLOOR = {"height_share": 0.0, "tilt_deg_per_m": 0.0}
-# Of simulated odometry, whose roll and pitch gravity holds.
+# Of simulated odometry: gravity holds roll and pitch, and turns are no worse than straight ways.
 SCALE = {
     "stated": "ignored",
     "scale": 0.01,
     "position_share": 0.0032,
     "rotation_deg_per_m": 0.016,
+    "rotation_share": 0.0,
     "tilt_deg_per_m": 0.0,
 }
 
@@ -63,7 +64,12 @@ class Drift(StrEnum):
 
 # A heading that wanders by 0.05 degrees after a metre wanders by 0.16 after ten.
 WHEELS: dict[Drift, dict[str, object]] = {
-    Drift.SLIP: {"steady": 0.01, "position_share": 0.002, "rotation_deg_per_m": 0.016},
+    Drift.SLIP: {
+        "steady": 0.01,
+        "position_share": 0.002,
+        "rotation_deg_per_m": 0.016,
+        "rotation_share": 0.0,
+    },
     Drift.WALK: {"steady": 0.0},
 }
 

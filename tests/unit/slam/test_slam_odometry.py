@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import moved
 from l2m_gtsam.slam.key_pose_readings import evenly_spread, key_pose_readings, thinned_readings
-from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps
+from l2m_gtsam.slam.odometry import PLANE, key_pose_rows, odometry_steps, plane_notes
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.slam.pose_graph import stated_information_root
 from tests.drives.slam import rounds
@@ -97,6 +97,18 @@ def test_a_steady_drift_of_a_level_vehicle_walks_level(seed: int, height_share: 
     of_height = height_share / 0.01
     expected = share**2 * over * 10.0 * np.array([1.0, 1.0, of_height**2])
     np.testing.assert_allclose(mount @ more @ mount.T, np.diag(expected), atol=1e-12)
+
+
+def test_odometry_of_wheels_is_known_by_its_plane() -> None:
+    """However the lidar is mounted; a millimetre of height is none of wheels' odometry."""
+    drive, mount = straight(10.0), Rotation.from_euler("xyz", [0.2, -0.1, 0.4]).as_matrix()
+    flat = replace(drive, R=drive.R @ mount)
+    assert plane_notes(flat, DriftOptions()) == (PLANE,)
+    assert plane_notes(flat, DriftOptions(height_share=0.0)) == ()
+    uneven = flat.p + np.random.default_rng(0).normal(0, 1e-3, flat.p.shape) * [0, 0, 1]
+    assert plane_notes(replace(flat, p=uneven), DriftOptions()) == ()
+    tilting = flat.R @ Rotation.from_rotvec([1e-3, 0, 0]).as_matrix()
+    assert plane_notes(replace(flat, R=np.vstack([flat.R[:9], tilting[9:]])), DriftOptions()) == ()
 
 
 def accumulated(drive: Trajectory, Q: FloatArray) -> Trajectory:

@@ -110,19 +110,19 @@ def test_the_likely_weights_predict_what_was_not_read() -> None:
 
 
 def test_waves_stay_within_their_number() -> None:
-    rough = Resolution(20.0, 12.0).evenly_within(OPTIONS.modes, OPTIONS.edge)
+    rough = Resolution(20.0, 12.0).within(OPTIONS.modes, OPTIONS.edge)
     tile = WaveTile.about(FieldPrior(Hyperparameters(), rough, OPTIONS), np.eye(3), places(1))
     # The count is that of a disc of half waves; its rim and the uniform field add to it.
     assert OPTIONS.modes < len(tile) < 1.3 * OPTIONS.modes
     assert rough.floor == rough.ceiling
 
     # A side that needs fewer leaves its share to the other.
-    smooth = Resolution(20.0, 1.0).evenly_within(OPTIONS.modes, OPTIONS.edge)
+    smooth = Resolution(20.0, 1.0).within(OPTIONS.modes, OPTIONS.edge)
     assert smooth.ceiling == 1.0
     assert smooth.floor > rough.floor
     assert smooth.modes(OPTIONS.edge) == pytest.approx(rough.modes(OPTIONS.edge))
     enough = Resolution(1.0, 1.0)
-    assert enough.evenly_within(OPTIONS.modes, OPTIONS.edge) == enough
+    assert enough.within(OPTIONS.modes, OPTIONS.edge) == enough
 
 
 def test_a_prior_is_not_learnt_from_nothing() -> None:
