@@ -232,7 +232,7 @@ def plane_notes(trajectory: Trajectory, options: DriftOptions) -> tuple[str, ...
 def steady_share(options: DriftOptions, *, is_stated: bool) -> FloatArray:
     """Return a steady drift's standard deviation along each axis as a share of the distance, (3,).
 
-    None if all are 0. Covariances that a recording states have what they share already.
+    All are 0 for none. Covariances that a recording states have what they share already.
     """
     if options.scale:
         return np.zeros(3)

@@ -269,11 +269,11 @@ class Intake:
         options = self._options
         readings = self._placed(waiting, trajectory, rows)
         steps = odometry_steps(trajectory, rows, options.drift)
-        share = steady_share(options.drift, is_stated=steps.stated)
         if self._steady:
             steps = steps.with_scale_as_drift(options.drift.over_m)
+            steady = float(steady_share(options.drift, is_stated=steps.stated)[0])
         else:
-            steps, share = steps.as_walk(options.drift.over_m), np.zeros(3)
+            steps, steady = steps.as_walk(options.drift.over_m), 0.0
         of_key_pose = key_pose_readings(readings, trajectory, rows)
         return ArrivedKeyPose(
             number,
@@ -285,7 +285,7 @@ class Intake:
             readings.stamp_ns,
             Links.none(),
             fixed=self._fixed(poses[0].T, poses[row].T),
-            steady=share,
+            steady=steady,
         )
 
     def _fixed(self, before: RigidTransform, after: RigidTransform) -> FixedStep | None:

@@ -57,7 +57,7 @@ def packed_key_poses(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
         "R": np.reshape([each.R for each in key_poses], (-1, 3, 3)),
         "p": np.reshape([each.p for each in key_poses], (-1, 3)),
         "covariance": np.reshape([each.covariance for each in key_poses], (-1, 6, 6)),
-        "steady": np.reshape([each.steady for each in key_poses], (-1, 3)),
+        "steady": np.array([each.steady for each in key_poses], dtype=np.float64),
         "count": np.array([len(each.readings) for each in key_poses], dtype=np.int64),
         "reading_ns": np.concatenate(
             [np.empty(0, dtype=np.int64), *(each.reading_ns for each in key_poses)]
@@ -87,11 +87,8 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
     of_links = under("link", arrays)
     links = Links(*(of_links[name] for name in LINKS))
     fixed = under("fixed", arrays)
-    # One share for all axes where a state is of an earlier version.
-    count = len(arrays["number"])
-    steady = np.broadcast_to(arrays["steady"].reshape(count, -1) if count else 0.0, (count, 3))
     found, reading, link = [], 0, 0
-    for k in range(count):
+    for k in range(len(arrays["number"])):
         rows = np.arange(reading, reading + int(arrays["count"][k]))
         own = np.arange(link, link + int(arrays["links"][k]))
         reading, link = reading + len(rows), link + len(own)
@@ -107,7 +104,7 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
                 arrays["reading_ns"][rows],
                 links[own],
                 fixed=step if np.isfinite(step.shift).all() else None,
-                steady=steady[k],
+                steady=float(arrays["steady"][k]),
             )
         )
     return found

@@ -21,7 +21,7 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import FieldWithWeights
 from l2m_gtsam.slam.unknown_field.whole_field import WholeField
 
 DISTORTION = 12
-NO_DRIFT = np.zeros((2, 3))
+NO_DRIFT = np.zeros(2)
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class FilterStep:
     readings
         n readings relative to its end, so that they correct the pose that is known then.
     steady
-        What a unit of a drift with time and with distance adds along each axis, metres, (2, 3).
+        What a unit of a drift with time and with distance adds, metres, shape (2,).
     fixed
         The step along fixed axes, where odometry knows it so.
     """

@@ -53,7 +53,11 @@ def followed(drive: Drive, field: WholeField, origin: gtsam.Pose3, largest: floa
 
 
 def filter_steps(drive: Drive) -> Iterator[FilterStep]:
-    """Yield the steps of a drive with their readings."""
+    """Yield the steps of a drive with their readings.
+
+    A steady drift counts as large along all axes as along the largest: none of the filter's axes,
+    those of the first key pose, need be vertical.
+    """
     steps, key = drive.steps, drive.readings.key_pose
     readings = from_end(drive.readings, steps.R[key], steps.p[key])
     bounds = np.searchsorted(key, np.arange(len(steps) + 1))
@@ -63,6 +67,6 @@ def filter_steps(drive: Drive) -> Iterator[FilterStep]:
             drive.step(k),
             steps.covariance[k],
             readings[np.arange(bounds[k], bounds[k + 1])],
-            NO_DRIFT if steps.steady is None else steps.steady[k],
+            NO_DRIFT if steps.steady is None else steps.steady[k].max(axis=1),
             None if fixed is None else FixedStep(steps.fixed_turns[k], fixed[k]),
         )

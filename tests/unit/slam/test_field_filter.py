@@ -107,8 +107,7 @@ def test_without_readings_it_is_odometry(field: WholeField, fixed: bool, share: 
     for before, after, motion in zip(poses[:-1], poses[1:], motions(), strict=True):
         turn = after.rotation().compose(before.rotation().inverse()).matrix()
         axes = FixedStep(turn, after.translation() - before.translation()) if fixed else None
-        steady = np.zeros((2, 3))
-        steady[1] = share * np.linalg.norm(motion.translation())
+        steady = np.array([0.0, share * np.linalg.norm(motion.translation())])
         step = FilterStep(motion, Q, no_readings(), steady, axes)
         state, reckoned = follows.after(state, step), reckoned.after(step)
     for found in (state.pose, reckoned.pose):
