@@ -9,8 +9,9 @@ import numpy as np
 from l2m_factors import Calibrations, KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform
 from l2m_gtsam.recording.odometry_jumps import Jump, RepairedOdometry
+from l2m_gtsam.slam.drift import drift_covariance
 from l2m_gtsam.slam.links import Links
-from l2m_gtsam.slam.odometry import OdometrySteps, drift_covariance
+from l2m_gtsam.slam.odometry import OdometrySteps
 from l2m_gtsam.slam.options import DriftOptions
 
 # Of the first pose, rad^2 and m^2, where no start is given: it defines the frame of the poses.

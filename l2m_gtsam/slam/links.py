@@ -10,7 +10,7 @@ from l2m_gtsam.geometry import between, compose, moved
 from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.scans import LoopClosure, PoseFix, ScanEvidence
-from l2m_gtsam.slam.odometry import drift_covariance
+from l2m_gtsam.slam.drift import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 
 MAP = -1  # in place of a key pose: the frame of the map

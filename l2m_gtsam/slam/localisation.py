@@ -17,11 +17,12 @@ from l2m_gtsam.recording.sync import SyncOptions, synchronise, with_offsets
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.records.scans import ScanEvidence
+from l2m_gtsam.slam.drift import plane_notes
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, odometry_jumps
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import key_pose_links, link_stamps
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
-from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, plane_notes, with_rows_at
+from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result

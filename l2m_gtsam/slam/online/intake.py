@@ -14,10 +14,11 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Traje
 from l2m_gtsam.geometry import between
 from l2m_gtsam.recording.sync import at_poses, has_pose, interpolated, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
+from l2m_gtsam.slam.drift import steady_share
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import Links
-from l2m_gtsam.slam.odometry import FixedStep, odometry_steps, steady_share
+from l2m_gtsam.slam.odometry import FixedStep, odometry_steps
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, ScanAtKeyPose
 from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep, suspect_step, velocity

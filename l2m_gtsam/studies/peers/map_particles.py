@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.options import Options
-from l2m_gtsam.slam.odometry import drift_covariance
+from l2m_gtsam.slam.drift import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 from l2m_gtsam.studies.peers.particle_slam import moments, systematic
 from l2m_gtsam.studies.peers.reduced_rank_ekf import POSE, FilteredPath

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Trajectory
-from l2m_gtsam.slam.odometry import drift_covariance
+from l2m_gtsam.slam.drift import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 
 TURN_RAD = np.deg2rad(0.05)  # of a heading after a metre

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from l2m_gtsam.progress import silent
-from l2m_gtsam.slam.odometry import drift_covariance
+from l2m_gtsam.slam.drift import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
 from tests.drives.drawn import DrawnDrive, drawn_drive

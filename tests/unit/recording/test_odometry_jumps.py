@@ -16,7 +16,7 @@ from l2m_gtsam.recording.odometry_jumps import (
     jump_notes,
     without_jumps,
 )
-from l2m_gtsam.slam.odometry import drift_covariance
+from l2m_gtsam.slam.drift import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 from tests.drives.faults import jumped, shift
 from tests.drives.slam import RATE_HZ, rounds

@@ -13,9 +13,10 @@ from l2m_gtsam.geometry import between, compose, difference, perturbed
 from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, spaced
 from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.scans import LoopClosure, PoseFix, ScanEvidence
+from l2m_gtsam.slam.drift import drift_covariance
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
 from l2m_gtsam.slam.links import MAP, key_pose_links, link_stamps
-from l2m_gtsam.slam.odometry import drift_covariance, key_pose_rows, odometry_steps, with_rows_at
+from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
 from l2m_gtsam.studies.slam_array.odometry import slipping

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import moved
+from l2m_gtsam.slam.drift import PLANE, plane_notes
 from l2m_gtsam.slam.key_pose_readings import evenly_spread, key_pose_readings, thinned_readings
-from l2m_gtsam.slam.odometry import PLANE, key_pose_rows, odometry_steps, plane_notes
+from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.slam.pose_graph import stated_information_root
 from tests.drives.slam import rounds
