@@ -269,6 +269,8 @@ class LocalisationResult:
         Of odometry; absent where it counts as right.
     gain
         What the correction of odometry is worth; absent where there was a map.
+    hints
+        What options would make poses better, a sentence each.
     """
 
     status: LocalisationStatus
@@ -288,3 +290,4 @@ class LocalisationResult:
     by_scans: Trajectory | None = None
     scale: OdometryScale | None = None
     gain: Gain | None = None
+    hints: tuple[str, ...] = ()

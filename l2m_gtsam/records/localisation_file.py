@@ -297,6 +297,8 @@ class LocalisationRecord(Record):
     gain
         What the correction of odometry is worth; absent where there was a map, and in files of
         older versions.
+    hints
+        What options would make poses better, a sentence each; none in files of older versions.
     """
 
     SHAPES: ClassVar[Mapping[str, str]] = {
@@ -326,3 +328,4 @@ class LocalisationRecord(Record):
     options: dict[str, Any]
     judgement: Judgement | None = None
     gain: Gain | None = None
+    hints: tuple[str, ...] = ()

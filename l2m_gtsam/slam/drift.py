@@ -8,14 +8,19 @@ from l2m_gtsam.slam.options import DriftOptions
 
 PLANAR = 1e-6  # metres and radians; a lidar or a gyroscope leaves a plane by more
 PLANE = (
-    "odometry never leaves a plane: if the floor is as even, `slam.drift.height_share: 0` and "
-    "`slam.drift.tilt_deg_per_m: 0` say so, and poses become better"
+    "Odometry never leaves a plane: if the floor is as even, `slam.drift.height_share: 0` and "
+    "`slam.drift.tilt_deg_per_m: 0` say so, and poses become better."
 )
 
 
-def plane_notes(trajectory: Trajectory, options: DriftOptions) -> tuple[str, ...]:
-    """Return what to say of odometry without heights and tilts, where options let these drift."""
-    if options.height_share is not None or options.tilt_deg_per_m is not None:
+def plane_hints(
+    trajectory: Trajectory, options: DriftOptions, *, is_stated: bool
+) -> tuple[str, ...]:
+    """Return what would help odometry without heights and tilts, where options let these drift.
+
+    Nothing where the recording states how odometry errs: options do not count there.
+    """
+    if is_stated or options.height_share is not None or options.tilt_deg_per_m is not None:
         return ()
     is_plane = (
         np.ptp(trajectory.p[:, 2]) <= PLANAR and np.ptp(trajectory.R[:, 2], axis=0).max() <= PLANAR

@@ -11,6 +11,7 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import Explored, LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.scans import ScanEvidence
+from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import EXACT_START, Drive
 from l2m_gtsam.slam.localisation import NO_SCANS, prepared
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
@@ -122,6 +123,7 @@ def explore(
             ),
             *([] if mapped.noise is None else [noise_note(mapped.noise, drive)]),
         ),
+        hints=plane_hints(recording.trajectory, options.drift, is_stated=drive.steps.stated),
         bag=recording.source,
         explored=explored,
         gain=mapped.gain,

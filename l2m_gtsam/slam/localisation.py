@@ -17,7 +17,7 @@ from l2m_gtsam.recording.sync import SyncOptions, synchronise, with_offsets
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.records.scans import ScanEvidence
-from l2m_gtsam.slam.drift import plane_notes
+from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, odometry_jumps
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import key_pose_links, link_stamps
@@ -112,7 +112,8 @@ def localise(
     kept = calibration if refined else None
     result = localisation_result(drive, solution, by_scans, kept, decoys)
     notes = (*notes, *odometry.notes, *result.notes, *decoy_notes(len(maps), len(decoys)))
-    result = replace(result, notes=notes, bag=recording.source, start=search)
+    hints = plane_hints(recording.trajectory, options.drift, is_stated=drive.steps.stated)
+    result = replace(result, notes=notes, hints=hints, bag=recording.source, start=search)
     return Localisation(result, solution)
 
 
@@ -180,8 +181,7 @@ def prepared(
         jumps=odometry_jumps(repaired, rows, options.drift),
     )
     recorded = (note for part in recording.parts for note in part.notes)
-    plane = () if drive.steps.stated else plane_notes(odometry, options.drift)
-    return drive, (*recorded, *repaired.notes(), *left_out, *masked.notes, *plane)
+    return drive, (*recorded, *repaired.notes(), *left_out, *masked.notes)
 
 
 def usable_sensors(

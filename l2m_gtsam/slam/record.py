@@ -113,6 +113,7 @@ def localisation_record(
         start=None if result.start is None else _start(result.start),
         explored=result.explored,
         gain=result.gain,
+        hints=result.hints,
         scans=result.scans,
         truth=truth,
         picture=map_picture(context.field_map, result.trajectory.p),

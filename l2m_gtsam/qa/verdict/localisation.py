@@ -80,6 +80,7 @@ def _shared_reasons(record: LocalisationRecord, options: SlamQaOptions) -> list[
         *_changed(record, path),
         *(Reason(Level.WARN, f"{each.rstrip('.')}.") for each in record.notes),
         *_sigmas(record),
+        *(Reason(Level.PASS, each) for each in record.hints),
         _drift(record),
         *([] if record.scale is None else [_scale(record.scale)]),
     ]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import moved
-from l2m_gtsam.slam.drift import PLANE, plane_notes
+from l2m_gtsam.slam.drift import PLANE, plane_hints
 from l2m_gtsam.slam.key_pose_readings import evenly_spread, key_pose_readings, thinned_readings
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
@@ -104,12 +104,14 @@ def test_odometry_of_wheels_is_known_by_its_plane() -> None:
     """However the lidar is mounted; a millimetre of height is none of wheels' odometry."""
     drive, mount = straight(10.0), Rotation.from_euler("xyz", [0.2, -0.1, 0.4]).as_matrix()
     flat = replace(drive, R=drive.R @ mount)
-    assert plane_notes(flat, DriftOptions()) == (PLANE,)
-    assert plane_notes(flat, DriftOptions(height_share=0.0)) == ()
+    assert plane_hints(flat, DriftOptions(), is_stated=False) == (PLANE,)
+    assert plane_hints(flat, DriftOptions(), is_stated=True) == ()
+    assert plane_hints(flat, DriftOptions(height_share=0.0), is_stated=False) == ()
     uneven = flat.p + np.random.default_rng(0).normal(0, 1e-3, flat.p.shape) * [0, 0, 1]
-    assert plane_notes(replace(flat, p=uneven), DriftOptions()) == ()
+    assert plane_hints(replace(flat, p=uneven), DriftOptions(), is_stated=False) == ()
     tilting = flat.R @ Rotation.from_rotvec([1e-3, 0, 0]).as_matrix()
-    assert plane_notes(replace(flat, R=np.vstack([flat.R[:9], tilting[9:]])), DriftOptions()) == ()
+    tilted = replace(flat, R=np.vstack([flat.R[:9], tilting[9:]]))
+    assert plane_hints(tilted, DriftOptions(), is_stated=False) == ()
 
 
 def accumulated(drive: Trajectory, Q: FloatArray) -> Trajectory:
