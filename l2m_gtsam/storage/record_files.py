@@ -133,7 +133,7 @@ def write_slam(path: Path, record: LocalisationRecord) -> None:
     OutputError
         The file cannot be written.
     """
-    absent = {name for name in ("judgement", "gain") if getattr(record, name) is None}
+    absent = {name for name in ("judgement", "gain", "hints") if not getattr(record, name)}
     file = _SlamFile("l2m-slam", 4, LEGEND, **fields_of(record, LocalisationRecord))
     _write(path, _SLAM.dump_json(file, exclude=absent))
 
