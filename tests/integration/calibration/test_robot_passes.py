@@ -56,17 +56,22 @@ def passes(shared_data: Path) -> Passes:
 
 @pytest.mark.study
 def test_errors_are_as_large_as_they_are_said_to_be(passes: Passes) -> None:
-    """Two are expected in the mean, and 11.4 of 12 inside; 1.96 and 11 when this was written."""
+    """Two are expected in the mean, and 11.4 of 12 inside; 2.4 and 11 when this was written."""
     assert 1 < passes.squared.mean() < 4
     assert np.count_nonzero(passes.squared < INSIDE) >= 11
 
 
 @pytest.mark.study
 def test_errors_are_a_few_millimetres(passes: Passes) -> None:
-    assert np.sqrt(np.mean(passes.errors**2)) < 0.0033
+    """Root mean square of x and y; 2.5 mm when this was written."""
+    assert np.sqrt(np.mean(passes.errors**2)) < 0.003
 
 
 @pytest.mark.study
+@pytest.mark.xfail(
+    reason="0.42: maps of two passes have two of three passes in common, and so their errors",
+    strict=True,
+)
 def test_passes_differ_by_as_much_as_is_said(passes: Passes) -> None:
     each = []
     for i, j in combinations(range(len(RUNS)), 2):
