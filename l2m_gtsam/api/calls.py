@@ -35,6 +35,13 @@ from l2m_gtsam.upkeep.kept_map import kept_up
 
 Values = Mapping[str, Any]
 Structure = npt.ArrayLike | str | Path | None
+READERS = {
+    "recording": "read_bag",
+    "surveys": "read_bag",
+    "drives": "read_bag",
+    "field_map": "load_map",
+    "calibration": "read_calibration",
+}
 
 
 def build_map(
@@ -63,6 +70,7 @@ def build_map(
     L2MError
         Whatever is wrong with the input, in one line.
     """
+    _refuse_paths(surveys=surveys)
     chosen = options_of(MappingOptions, options, "mapping")
     drives = [surveys] if isinstance(surveys, Recording) else list(surveys)
     if structure is not None:
@@ -100,6 +108,7 @@ def keep_map_up(
     L2MError
         Whatever is wrong with the input, in one line.
     """
+    _refuse_paths(field_map=field_map, drives=drives)
     every = [drives] if isinstance(drives, Recording) else list(drives)
     return kept_up(
         field_map,
@@ -108,6 +117,23 @@ def keep_map_up(
         options_of(MappingOptions, options, "mapping"),
         options_of(ChangesOptions, changes, "calibration.changes"),
     )
+
+
+def _refuse_paths(**given: Any) -> None:
+    """Refuse paths, and lists of them, in place of what is read from them.
+
+    Raises
+    ------
+    InputError
+        It says which function reads the file.
+    """
+    for name, value in given.items():
+        paths = value if isinstance(value, list | tuple) else [value]
+        for path in paths:
+            if isinstance(path, str | Path):
+                raise InputError(
+                    f"{name}: {str(path)!r} is a path; `l2m_gtsam.{READERS[name]}` reads it"
+                )
 
 
 def _sensors(
@@ -161,6 +187,7 @@ def calibrate(
     L2MError
         Whatever is wrong with the input, in one line.
     """
+    _refuse_paths(recording=recording, field_map=field_map)
     chosen = options_of(CalibrationOptions, options, "calibration")
     limits = options_of(QaOptions, qa, "qa")
     found = calibrated(recording, field_map, chosen, None, progress)
@@ -199,6 +226,7 @@ def localise(
     L2MError
         Whatever is wrong with the input, in one line.
     """
+    _refuse_paths(recording=recording, calibration=calibration, field_map=field_map)
     chosen = options_of(SlamOptions, options, "slam")
     known = calibration.result if isinstance(calibration, JudgedCalibration) else calibration
     if field_map is None:
