@@ -40,6 +40,7 @@ LEGEND = {
     "gain": "of a drive without a map: nats by which readings are likelier at the corrected poses "
     "than at odometry's, m rms between both, probability that odometry's are nearer to the truth; "
     "not shown: the poses are odometry's",
+    "hints": "what options would make poses better",
     "steps": "mean square of the whitened differences between steps of the poses and odometry's",
     "truth": "errors against a trajectory that was given, nothing aligned; expected nees: 6",
     "start": "candidates for the start of the drive over the whole map, the likeliest first; "

@@ -113,12 +113,8 @@ def affordable(resolution: Resolution, options: TilingOptions, budget: int) -> R
 
     What is left out, the shortest waves of whichever side, counts as variance.
     """
-    return resolution.within(budget, smallest_edge(options))
-
-
-def smallest_edge(options: TilingOptions) -> float:
-    """Return the edge of the box of the smallest tile in metres."""
-    return LEAST_CORE + 2 * (options.overlap + options.margin)
+    smallest = LEAST_CORE + 2 * (options.overlap + options.margin)
+    return resolution.within(budget, smallest)
 
 
 def surveyed_area(points: FloatArray) -> float:

@@ -19,20 +19,23 @@ from l2m_gtsam.studies.slam_array.places import Drift, DriveInMap, robot
 from l2m_gtsam.studies.slam_array.robot import RUNS
 from tests.support.pose_errors import pose_nees, position_error
 
-HIGHEST = 12.0  # of NEES; 6 where sigmas are right, less where odometry errs less than it states
+LOWEST, HIGHEST = 3.0, 12.0  # of NEES; 6 where sigmas are right
 IN_MAP, WITHOUT = 0.85, 0.7  # share of odometry's error that is to be removed
 
 
-# Where less is removed than wanted. Without a map no gain is shown, except for pass 4 with slips,
-# where a pivot is taken for a slip.
+# Where less is removed than wanted, or NEES is low: heights and tilts hardly err, and odometry errs
+# less than it states. Without a map no gain is shown where the doubt exceeds 5 %.
 MISSED_IN_MAP = {
+    (4, Drift.SLIP): "NEES 1.9",
     (2, Drift.WALK): "83 % removed",
     (3, Drift.WALK): "62 % of 116 mm removed",
     (4, Drift.WALK): "80 % of 98 mm removed",
 }
 MISSED_WITHOUT = {
+    (1, Drift.SLIP): "NEES 0.7",
+    (3, Drift.SLIP): "NEES 0.4",
     (2, Drift.SLIP): "doubt of 8 %",
-    (4, Drift.SLIP): "60 % removed",
+    (4, Drift.SLIP): "60 % removed, a pivot is taken for a slip",
     (1, Drift.WALK): "doubt of 9 %",
     (2, Drift.WALK): "doubt of 9 %",
     (3, Drift.WALK): "doubt of 7 %",
@@ -69,8 +72,8 @@ class Solved:
         """Of the poses after the first."""
         return float(pose_nees(self.truth, self.result.trajectory)[1:].mean())
 
-    def told(self) -> str:
-        """Say what came of it."""
+    def summary(self) -> str:
+        """Return errors and NEES in one line."""
         name = f"{self.run}, {self.kind}"
         return f"{name}: {1e3 * self.before:.0f} -> {1e3 * self.after:.0f} mm, NEES {self.nees:.1f}"
 
@@ -94,10 +97,10 @@ def test_in_the_map_of_the_others(
     drive = place.with_odometry(odometry)
     found = localise(drive, place.field_map, place.calibration, place.options[kind], silent).result
     solved = Solved(run, kind, place.truth, found)
-    print(f"in the map: {solved.told()}")
+    print(f"in the map: {solved.summary()}")
     assert not any("jumps" in note for note in found.notes)
     assert solved.after <= (1 - IN_MAP) * solved.before
-    assert solved.nees <= HIGHEST
+    assert LOWEST <= solved.nees <= HIGHEST
 
 
 @pytest.fixture(scope="module", params=[(run, kind) for kind in Drift for run in RUNS])
@@ -114,10 +117,10 @@ def without_map(request: pytest.FixtureRequest, shared_data: Path) -> Solved:
 def test_without_a_map(without_map: Solved, request: pytest.FixtureRequest) -> None:
     """The same with the others' calibration alone."""
     expect(request, MISSED_WITHOUT.get((without_map.run, without_map.kind)))
-    print(f"without a map: {without_map.told()}, {without_map.result.gain}")
+    print(f"without a map: {without_map.summary()}, {without_map.result.gain}")
     assert not any("jumps" in note for note in without_map.result.notes)
     assert without_map.after <= (1 - WITHOUT) * without_map.before
-    assert without_map.nees <= HIGHEST
+    assert LOWEST <= without_map.nees <= HIGHEST
 
 
 @pytest.mark.study

@@ -14,7 +14,7 @@ BAG, MAP, FILE = "drive.bag", Path("map.npz"), "calibration.yaml"
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (lambda api: api.calibrate(BAG, None), r"recording: 'drive\.bag' .* `l2m_gtsam\.read_bag`"),
         (lambda api: api.calibrate([BAG], None), "recording: .* `l2m_gtsam.read_bag`"),
@@ -24,8 +24,8 @@ BAG, MAP, FILE = "drive.bag", Path("map.npz"), "calibration.yaml"
         (lambda api: api.keep_map_up(None, BAG, []), "drives: .* `l2m_gtsam.read_bag`"),
     ],
 )
-def test_a_path_is_refused_with_what_reads_it(call: Callable[[Any], object], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_a_path_is_refused_with_what_reads_it(call: Callable[[Any], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
         call(l2m_gtsam)
 
 

@@ -67,7 +67,7 @@ def texts(verdict: Verdict, level: Level) -> list[str]:
     return [each.text for each in reasons if each.level is level]
 
 
-def test_a_hint_is_told_and_is_no_warning() -> None:
+def test_a_hint_is_shown_and_is_no_warning() -> None:
     """Of what options would make poses better."""
     verdict = judged(replace(good(), hints=("Say more of odometry.",)))
     assert verdict.level is Level.PASS
