@@ -20,6 +20,7 @@ from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.slam.online.follower import SECTION, Follower
 from l2m_gtsam.slam.online.key_pose import key_poses_of
+from l2m_gtsam.slam.options import DriftOptions
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.worlds.exact import random_sensors
@@ -65,8 +66,9 @@ def laps(count: int) -> Trajectory:
 
 def followed(drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: int = SECTION) -> Run:
     """Follow a drive and take the time of each key pose."""
-    drive, robust = drawn.drive, RobustOptions()
-    follower = Follower(drive.start, drive.sensors, field_map, robust, free=free, section=section)
+    drive, robust, drift = drawn.drive, RobustOptions(), DriftOptions()
+    start, sensors = drive.start, drive.sensors
+    follower = Follower(start, sensors, field_map, robust, drift, free=free, section=section)
     count, warm = len(drawn.drive), len(drawn.drive) // 10
     cost, off, memory = np.zeros(count), np.zeros(count), 0.0
     for number, key_pose in enumerate(key_poses_of(drive)):

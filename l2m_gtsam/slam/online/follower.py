@@ -37,6 +37,8 @@ from l2m_gtsam.slam.online.measurements import (
     update,
 )
 from l2m_gtsam.slam.online.section import Section
+from l2m_gtsam.slam.online.tracked_drift import TrackedDrift
+from l2m_gtsam.slam.options import DriftOptions
 from l2m_gtsam.slam.pose_graph import (
     between_factor,
     calibration_graph,
@@ -93,10 +95,11 @@ class PendingKeyPoses:
 
 @dataclass(frozen=True)
 class LastBelief:
-    """The number of a key pose, and what is known of it and of the sensors."""
+    """The number of a key pose, and what is known of it, of the sensors and of odometry's drift."""
 
     number: int
     belief: Belief
+    drift: TrackedDrift
 
 
 class Follower:
@@ -112,6 +115,8 @@ class Follower:
         Map that is queried for field and variance.
     robust
         Loss and confidence of the gate.
+    drift
+        Of odometry.
     free
         Whether calibrations are variables.
     section
@@ -124,6 +129,7 @@ class Follower:
         sensors: KnownSensors,
         field_map: QueryableMap,
         robust: RobustOptions,
+        drift: DriftOptions,
         *,
         free: bool,
         section: int = SECTION,
@@ -138,6 +144,7 @@ class Follower:
         self.fixes_refused = 0
         self._section = Section(self._calibrations)
         self._belief, self._pending = self._prior(start), self._opening(start)
+        self._drift = TrackedDrift.at_start(drift.of_height, drift.over_m, self._belief)
 
     @classmethod
     def resumed(
@@ -145,6 +152,7 @@ class Follower:
         last: "LastBelief",
         field_map: QueryableMap,
         robust: RobustOptions,
+        drift: DriftOptions,
         *,
         free: bool,
         section: int = SECTION,
@@ -154,7 +162,7 @@ class Follower:
         pose = belief.pose
         T_map_lidar = as_transform(pose)
         start = StartPose(T_map_lidar, belief.pose_covariance)
-        own = cls(start, belief.sensors, field_map, robust, free=free, section=section)
+        own = cls(start, belief.sensors, field_map, robust, drift, free=free, section=section)
         values, sizes = gtsam.Values(), {X(number): POSE}
         values.insert(X(number), pose)
         if free:
@@ -164,7 +172,7 @@ class Follower:
         prior = gtsam.NonlinearFactorGraph()
         for factor in prior_factors(JointGaussian(values, sizes, belief.covariance)):
             prior.add(factor)
-        own._belief, own._pending = belief, PendingKeyPoses()
+        own._belief, own._pending, own._drift = belief, PendingKeyPoses(), last.drift
         own._first = own._last = number
         own._section.add(prior, values, number, 0)
         return own
@@ -177,7 +185,11 @@ class Follower:
     @property
     def last(self) -> "LastBelief":
         """What is known of the last key pose, from which another follower can go on."""
-        return LastBelief(self._last, self._belief)
+        return LastBelief(self._last, self._belief, self._drift)
+
+    def expected(self, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
+        """Return the next key pose without what is known of odometry's steady drift."""
+        return self._drift.without(key_pose, self._belief)
 
     def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior.
@@ -187,15 +199,19 @@ class Follower:
         CalibrationError
             The system is too badly scaled to be solved.
         """
-        number = key_pose.number
+        number, told = key_pose.number, self.used
         if number > 0:
             self._advance(key_pose)
-        self._update_by_fixes(key_pose.links)
+        is_fixed = self._update_by_fixes(key_pose.links)
         self._pending.values.insert(X(number), self._belief.pose)
         self._last = number
         # Not before there was a reading: iSAM2 needs the filter's estimate of calibrations far off.
         if 0 < number < EARLY or (number + 1) % GROUP == 0:
             self._update_section()
+        if key_pose.lost or key_pose.recorded is not None:
+            self._drift = self._drift.anchored(self._belief)
+        elif is_fixed or self.used > told:
+            self._drift = self._drift.seen(self._belief)
         return self._belief
 
     def finish(self) -> Belief:
@@ -228,9 +244,9 @@ class Follower:
         covariance = block_diag(start.covariance, *known)
         return Belief(as_pose(start.T_map_lidar), self._sensors, covariance)
 
-    def _update_by_fixes(self, links: Links) -> None:
-        """Update by the scan fixes of a key pose that pass the gate."""
-        most = self._robust.largest_of(POSE)
+    def _update_by_fixes(self, links: Links) -> bool:
+        """Update by the scan fixes of a key pose that pass the gate; return whether one does."""
+        most, passed = self._robust.largest_of(POSE), False
         for row in np.flatnonzero(links.in_map).tolist():
             covariance = self._belief.pose_covariance + links.covariance[row]
             off = gtsam.Pose3.Logmap(link_pose(links, row).between(self._belief.pose))
@@ -238,31 +254,34 @@ class Follower:
                 self.fixes_refused += 1
             else:
                 measure = partial(fix_measurement, link_pose(links, row), links.covariance[row])
-                self._belief = self._belief.updated(measure)
+                self._belief, passed = self._belief.updated(measure), True
                 self._pending.graph.add(link_factor(links, row))
+        return passed
 
     def _advance(self, key_pose: ArrivedKeyPose) -> None:
         """Predict a key pose from the one before, and update by the readings between them."""
-        belief = self._belief.predicted(key_pose.step, key_pose.covariance)
-        self._belief = self._update_by_readings(key_pose, belief).marginalize_previous()
-        before = key_pose.number - 1
-        self._pending.graph.add(between_factor(before, key_pose.step, key_pose.covariance))
+        expected, before = self.expected(key_pose), key_pose.number - 1
+        self._drift = self._drift.moved(key_pose, self._belief)
+        # Readings are placed by odometry's own step.
+        of_step = StepReadings(key_pose.readings, key_pose.step, expected.covariance)
+        belief = self._belief.predicted(expected.step, expected.covariance)
+        self._belief = self._update_by_readings(of_step, before, belief).marginalize_previous()
+        self._pending.graph.add(between_factor(before, expected.step, expected.covariance))
 
     def _update_by_readings(
-        self, key_pose: ArrivedKeyPose, belief: PredictedBelief
+        self, of_step: StepReadings, before: int, belief: PredictedBelief
     ) -> PredictedBelief:
         """Return the belief updated by the readings after a key pose that pass the gate."""
-        if not len(key_pose.readings):
+        if not len(of_step):
             return belief
-        of_step = StepReadings(key_pose.readings, key_pose.step, key_pose.covariance)
         measurement = StepMeasurement(of_step, self._map)
         gated = gate(measurement, self._variance, belief, self._robust)
-        self.seen += len(key_pose.readings)
+        self.seen += len(of_step)
         self.used += len(gated.rows)
         if not len(gated.rows):
             return belief
         updated = update(measurement.of(gated.rows), gated.own, belief)
-        step = StepError(key_pose.number - 1, updated.belief.step, updated.by_step)
+        step = StepError(before, updated.belief.step, updated.by_step)
         readings = of_step[gated.rows].shifted(updated.belief.step)
         self._pending.accepted.append(AcceptedReadings(readings, updated.whitening, step))
         return updated.belief

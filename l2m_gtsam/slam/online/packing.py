@@ -14,9 +14,11 @@ from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import FixedStep
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+from l2m_gtsam.slam.online.tracked_drift import DriftPrior, TrackedDrift, WaySinceAnchor
 
 Arrays = dict[str, npt.NDArray[Any]]
 LINKS = ("origin", "key_pose", "R", "p", "covariance")
+WAY = ("p", "p_covariance", "shift", "random")
 READINGS = ("key_pose", "sensor", "R_key_lidar", "p_key_lidar", "fraction", "field")
 
 
@@ -108,6 +110,32 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
             )
         )
     return found
+
+
+def packed_drift(tracked: TrackedDrift) -> Arrays:
+    """Return a tracked drift as arrays."""
+    way, both = tracked.way, (tracked.before, tracked.known)
+    return {
+        "mean": np.stack([each.drift for each in both]),
+        "covariance": np.stack([each.covariance for each in both]),
+        "p": way.p,
+        "p_covariance": way.covariance,
+        "shift": way.shift,
+        "random": way.random,
+        "length": np.array([way.drift_m, tracked.untold_m]),
+    }
+
+
+def unpacked_drift(arrays: Arrays, over_m: float) -> TrackedDrift:
+    """Return a tracked drift of ``packed_drift``."""
+    before, known = (
+        DriftPrior(mean, covariance)
+        for mean, covariance in zip(arrays["mean"], arrays["covariance"], strict=True)
+    )
+    drift_m, untold_m = arrays["length"].tolist()
+    p, covariance, shift, random = (arrays[name] for name in WAY)
+    way = WaySinceAnchor(p, covariance, shift, random, drift_m)
+    return TrackedDrift(before, known, way, over_m, untold_m)
 
 
 def packed_gaussian(known: JointGaussian) -> Arrays:

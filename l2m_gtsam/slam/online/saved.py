@@ -24,10 +24,12 @@ from l2m_gtsam.slam.online.packed_one_field import packed_one_field, unpacked_on
 from l2m_gtsam.slam.online.packing import (
     Arrays,
     named,
+    packed_drift,
     packed_gaussian,
     packed_key_poses,
     packed_poses,
     under,
+    unpacked_drift,
     unpacked_gaussian,
     unpacked_key_poses,
     unpacked_poses,
@@ -164,17 +166,21 @@ def _packed_follower(follower: Follower) -> Arrays:
         "t": sensors.t,
         "distortion": sensors.distortion,
         "number": np.array([last.number], dtype=np.int64),
+        **named("drift", packed_drift(last.drift)),
     }
 
 
 def _resume_following(slam: OnlineSlam, arrays: Arrays) -> None:
     sensors = replace(slam.sensors, t=arrays["t"], distortion=arrays["distortion"])
     belief = Belief(unpacked_poses(arrays)[0], sensors, arrays["covariance"])
+    options = slam.options
+    drift = unpacked_drift(under("drift", arrays), options.drift.over_m)
     slam.estimator = Follower.resumed(
-        LastBelief(int(arrays["number"][0]), belief),
+        LastBelief(int(arrays["number"][0]), belief, drift),
         slam.known_map(),
-        slam.options.robust,
-        free=slam.options.calibration is CalibrationUse.REFINED,
+        options.robust,
+        options.drift,
+        free=options.calibration is CalibrationUse.REFINED,
     )
 
 

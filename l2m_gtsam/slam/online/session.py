@@ -138,7 +138,8 @@ class OnlineSlam:
         self.options, self.sensors = options, known_sensors(usable)
         self._map = None if field_map is None else for_solvers(field_map)
         self.matcher = matcher
-        self.intake = Intake(self.sensors, options, steady=self._one_field)
+        knows_drift = self._one_field or field_map is not None
+        self.intake = Intake(self.sensors, options, steady=knows_drift)
         self.estimator: Follower | Explorer | OneFieldExplorer | None = None
         self.search: StartSearchState | None = None
         self.base, self.stamp_ns = 0, 0  # number of the first key pose, time of the last
@@ -222,7 +223,8 @@ class OnlineSlam:
 
     def _follower(self, start: StartPose) -> Follower:
         free, robust = self.options.calibration is CalibrationUse.REFINED, self.options.robust
-        return Follower(start, self.sensors, self.known_map(), robust, free=free)
+        drift = self.options.drift
+        return Follower(start, self.sensors, self.known_map(), robust, drift, free=free)
 
     def known_map(self) -> QueryableMap:
         """Return the map.
@@ -275,7 +277,7 @@ class OnlineSlam:
         if estimator is None:
             raise ConfigError("the drive has not begun")
         seen, used, refused = estimator.seen, estimator.used, estimator.fixes_refused
-        key_pose = self._with_fixes(estimator.belief, key_pose)
+        key_pose = self._with_fixes(estimator, key_pose)
         belief = estimator.add(key_pose)
         estimator.release()
         if estimator.fixes_refused > refused:
@@ -300,11 +302,11 @@ class OnlineSlam:
             self._report(EventKind.FIELD_LEARNT, text)
         return belief
 
-    def _with_fixes(self, before: Belief, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
+    def _with_fixes(self, follower: Follower, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
         """Return a key pose with what its scans say of its place in the map."""
         if not isinstance(self.matcher, ScanMatcher) or not key_pose.scans:
             return key_pose
-        expected = expected_place(before, key_pose)
+        expected = expected_place(follower.belief, follower.expected(key_pose))
         found = self.matcher.fixes(key_pose.scans, key_pose.number, expected, key_pose.length_m)
         return self._linked(key_pose, found)
 

@@ -35,6 +35,14 @@ class LinearField(ABC):
     def unresolved(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis of what the weights do not hold, uT^2, shape (N, 3)."""
 
+    @abstractmethod
+    def unresolved_together(self, points: FloatArray) -> FloatArray:
+        """Return it times the number of points that have it in common, uT^2, shape (N, 3).
+
+        Near each other it is the same error, of which n readings say no more than one. With n
+        times the variance each they say as little, where readings count as independent.
+        """
+
     def robust_weights(
         self, points: FloatArray, field: FloatArray, variance: FloatArray
     ) -> FloatArray:

@@ -12,6 +12,7 @@ from l2m_gtsam.slam.map_prediction import MapPrediction
 from l2m_gtsam.slam.pose_graph import successive
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.unknown_field.field_memory import RememberedTile
+from l2m_gtsam.slam.unknown_field.linear_field import AXES
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
 
@@ -75,9 +76,13 @@ class TileReadings:
         for stage in np.unique(mu):
             own = mu == stage
             weights[own] = WEIGHTS[robust.loss](r2[own], robust.largest, stage)
+        # A reading is judged by itself; those that count share what the waves leave out.
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
-        W = W[chosen] * np.sqrt(weights[chosen])[:, None, None]
-        variance = noise[:, None] ** 2 + laid.field.unresolved(laid.placed.x)
+        unresolved = np.zeros((len(mu), AXES))
+        unresolved[chosen] = laid.field.unresolved_together(laid.placed.x[chosen])
+        variance = noise[:, None] ** 2 + unresolved
+        W = prediction.whitening_of(noise, unresolved)[chosen]
+        W *= np.sqrt(weights[chosen])[:, None, None]
         readings = of_section.readings[laid.rows[chosen]]
         blocks = TileBlocks(laid.number, laid.anchor, laid.field, readings, W, of_section.fixed)
         return cls(laid, chosen, variance[chosen] / weights[chosen, None], blocks)

@@ -21,7 +21,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
     resolution_of,
     surveyed_area,
 )
-from l2m_gtsam.maps.training import merged, training_set
+from l2m_gtsam.maps.training import cubes_of, merged, training_set
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
 from l2m_gtsam.slam.options import TileOptions
@@ -32,6 +32,7 @@ from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 # square of this factor; the loss is small, for readings are dense along the path.
 WIDER = 10.0
 
+ALONG_AXES = np.array([0.5, 0.5, 1.0])  # variance of waves, in that of their vertical part
 GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
 
 
@@ -157,14 +158,32 @@ class WaveTile(LinearField):
 
     def unresolved(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis of unresolved waves, uT^2, shape (N, 3)."""
+        return np.asarray(self._unresolved_of_sides(points).sum(axis=0)[:, None] * ALONG_AXES)
+
+    def unresolved_together(self, points: FloatArray) -> FloatArray:
+        """Return it times the number of points within half of the longest unresolved wave."""
+        kept, edge = self.prior.resolution, self.prior.options.edge
+        together = np.zeros(len(points))
+        for side, variance in zip(
+            (kept.floor, kept.ceiling), self._unresolved_of_sides(points), strict=True
+        ):
+            cell = cubes_of(points, np.pi / max(side, np.pi / edge))
+            together += np.bincount(cell)[cell] * variance
+        return np.asarray(together[:, None] * ALONG_AXES)
+
+    def _unresolved_of_sides(self, points: FloatArray) -> FloatArray:
+        """Return the variance of Bz by unresolved waves of floor and ceiling, uT^2, (2, N)."""
         h, kept = self.prior.hyperparameters, self.prior.resolution
         z = self.basis.frame.localise(points)[:, 2]
         over = self.basis.frame.height - z
         # The series diverges towards the sources: nearer than half their depth it is held constant.
         z, over = np.maximum(z, -0.5 * h.floor_depth), np.maximum(over, -0.5 * h.ceiling_depth)
-        vertical = left_out(h.floor_scale, h.floor_depth, kept.floor, z)
-        vertical = vertical + left_out(h.ceiling_scale, h.ceiling_depth, kept.ceiling, over)
-        return np.asarray(vertical[:, None] * np.array([0.5, 0.5, 1.0]))
+        return np.stack(
+            [
+                left_out(h.floor_scale, h.floor_depth, kept.floor, z),
+                left_out(h.ceiling_scale, h.ceiling_depth, kept.ceiling, over),
+            ]
+        )
 
 
 @dataclass(frozen=True)

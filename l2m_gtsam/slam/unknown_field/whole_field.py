@@ -70,6 +70,10 @@ class WholeField(LinearField):
         """Return none, shape (N, 3): what they do not hold is learnt with the noise."""
         return np.zeros((len(points), 3))
 
+    def unresolved_together(self, points: FloatArray) -> FloatArray:
+        """Return none, shape (N, 3)."""
+        return self.unresolved(points)
+
 
 @dataclass(frozen=True)
 class WholePrior:

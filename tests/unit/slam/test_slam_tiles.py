@@ -125,6 +125,25 @@ def test_waves_stay_within_their_number() -> None:
     assert enough.within(OPTIONS.modes, OPTIONS.edge) == enough
 
 
+@given(seed=st.integers(0, 1000), count=st.integers(1, 30))
+@settings(deadline=None, max_examples=20)
+def test_what_waves_leave_out_does_not_average_out_at_one_place(seed: int, count: int) -> None:
+    """The mean of n readings of a place: of their noise a share of n is left, of this all."""
+    one, noise = places(seed, 1), 0.2
+    tile = WaveTile.about(PRIOR, np.eye(3), np.vstack([one, places(seed + 1)]))
+    own = tile.unresolved(one)
+    np.testing.assert_allclose(tile.unresolved_together(one), own, rtol=1e-12)
+    each = noise**2 + tile.unresolved_together(np.repeat(one, count, axis=0))
+    np.testing.assert_allclose(1 / np.sum(1 / each, axis=0), noise**2 / count + own[0], rtol=1e-9)
+
+
+def test_what_waves_leave_out_averages_out_over_a_way() -> None:
+    """Places further apart than half of the longest wave that is left out, 0.8 and 1.1 m."""
+    apart = np.column_stack([np.arange(-3.0, 3.1, 1.2), np.zeros(6), np.full(6, 0.2)])
+    tile = WaveTile.about(PRIOR, np.eye(3), apart)
+    np.testing.assert_allclose(tile.unresolved_together(apart), tile.unresolved(apart), rtol=1e-12)
+
+
 def test_a_prior_is_not_learnt_from_nothing() -> None:
     with pytest.raises(MapError, match="training readings"):
         field_prior(np.zeros((3, 3)), np.ones((3, 3)), OPTIONS)
