@@ -5,6 +5,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_factors import D, T, X
@@ -207,16 +209,37 @@ def test_variance_is_remembered_by_place() -> None:
     assert field_map.asked == 3
 
 
+@given(counts=st.lists(st.integers(1, 4), min_size=1, max_size=12), noise=st.floats(0.01, 10.0))
+@settings(deadline=None, max_examples=50)
+def test_readings_of_a_visit_say_what_their_mean_does(counts: list[int], noise: float) -> None:
+    """The map's error is one in a cell: of k readings u + s^2 / k is left."""
+    known, at = CachedVariance(HalfMap()), np.array([[1.0, 0.0, 0.5]])
+    u, said = known.at(at)[0], np.zeros(3)
+    for key_pose, count in enumerate(counts):
+        near = at + 0.01 * np.random.default_rng(key_pose).random((count, 3))
+        own = np.full(count, noise)
+        said += np.sum(1 / (noise**2 + known.one_by_one(near, own, key_pose)), axis=0)
+    np.testing.assert_allclose(1 / said, u + noise**2 / sum(counts), rtol=1e-9)
+
+
+def test_elsewhere_and_later_the_error_of_the_map_is_another() -> None:
+    known, at = CachedVariance(HalfMap()), np.array([[1.0, 0.0, 0.5], [2.0, 1.0, 0.5]])
+    first = known.one_by_one(at, np.full(2, NOISE), 3)
+    np.testing.assert_allclose(first, known.at(at))
+    assert (known.one_by_one(at, np.full(2, NOISE), 4) > first).all()
+    np.testing.assert_allclose(known.one_by_one(at, np.full(2, NOISE), 4 + 21), first)
+
+
 def test_the_heading_of_the_start_is_found() -> None:
     """Five degrees and 0.2 m more off at the first pose, which the start's sigmas allow.
 
     What the prior still pulls by goes with its share in all that is known of the heading then.
     """
-    given = drawn(8.0)
-    start = given.drive.start
+    whole = drawn(8.0)
+    start = whole.drive.start
     R = Rotation.from_euler("z", 5, degrees=True).as_matrix() @ start.T_map_lidar.R
     off = replace(start, T_map_lidar=replace(start.T_map_lidar, R=R))
-    last, plain = (followed(each)[-1] for each in (replace(given.drive, start=off), given.drive))
+    last, plain = (followed(each)[-1] for each in (replace(whole.drive, start=off), whole.drive))
     share = last.pose_covariance[2, 2] / start.covariance[2, 2]
     assert share < 0.25
     heading = gtsam.Rot3.Logmap(plain.pose.rotation().between(last.pose.rotation()))[2]
