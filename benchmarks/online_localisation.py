@@ -66,9 +66,9 @@ def laps(count: int) -> Trajectory:
 
 def followed(drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: int = SECTION) -> Run:
     """Follow a drive and take the time of each key pose."""
-    drive, robust, drift = drawn.drive, RobustOptions(), DriftOptions()
+    drive, robust, over_m = drawn.drive, RobustOptions(), DriftOptions().over_m
     start, sensors = drive.start, drive.sensors
-    follower = Follower(start, sensors, field_map, robust, drift, free=free, section=section)
+    follower = Follower(start, sensors, field_map, robust, over_m, free=free, section=section)
     count, warm = len(drawn.drive), len(drawn.drive) // 10
     cost, off, memory = np.zeros(count), np.zeros(count), 0.0
     for number, key_pose in enumerate(key_poses_of(drive)):

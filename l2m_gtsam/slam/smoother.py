@@ -220,8 +220,8 @@ def localise_drive(
     """Estimate the poses of a drive, and its calibrations if these are to be refined."""
     problem = SmoothingProblem(drive, field_map, options)
     followed = drive.as_walk(options.drift.over_m)
-    start, sensors, robust = followed.start, followed.sensors, options.robust
-    follower = Follower(start, sensors, field_map, robust, options.drift, free=problem.free)
+    start, sensors, over_m = followed.start, followed.sensors, options.drift.over_m
+    follower = Follower(start, sensors, field_map, options.robust, over_m, free=problem.free)
     values = follow(follower, followed, progress)
     values.insert(shared_values(drive))
     counts = np.ones(len(drive.readings), dtype=np.bool_)

@@ -18,7 +18,7 @@ def followed_beliefs(
     section: int = SECTION,
 ) -> list[Belief]:
     """Return what was known of each key pose when it came, of the last when all was solved."""
-    start, sensors, drift = drive.start, drive.sensors, DriftOptions()
-    follower = Follower(start, sensors, field_map, robust, drift, free=free, section=section)
+    start, sensors, over_m = drive.start, drive.sensors, DriftOptions().over_m
+    follower = Follower(start, sensors, field_map, robust, over_m, free=free, section=section)
     beliefs = [follower.add(each) for each in key_poses_of(drive)]
     return [*beliefs[:-1], follower.finish()]

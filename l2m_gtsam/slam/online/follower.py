@@ -38,7 +38,6 @@ from l2m_gtsam.slam.online.measurements import (
 )
 from l2m_gtsam.slam.online.section import Section
 from l2m_gtsam.slam.online.tracked_drift import TrackedDrift
-from l2m_gtsam.slam.options import DriftOptions
 from l2m_gtsam.slam.pose_graph import (
     between_factor,
     calibration_graph,
@@ -115,8 +114,8 @@ class Follower:
         Map that is queried for field and variance.
     robust
         Loss and confidence of the gate.
-    drift
-        Of odometry.
+    over_m
+        The distance over which what is left of a steady drift of odometry counts as a random walk.
     free
         Whether calibrations are variables.
     section
@@ -129,7 +128,7 @@ class Follower:
         sensors: KnownSensors,
         field_map: QueryableMap,
         robust: RobustOptions,
-        drift: DriftOptions,
+        over_m: float,
         *,
         free: bool,
         section: int = SECTION,
@@ -144,7 +143,7 @@ class Follower:
         self.fixes_refused = 0
         self._section = Section(self._calibrations)
         self._belief, self._pending = self._prior(start), self._opening(start)
-        self._drift = TrackedDrift.at_start(drift.of_height, drift.over_m, self._belief)
+        self._drift = TrackedDrift.at_start(over_m, self._belief)
 
     @classmethod
     def resumed(
@@ -152,7 +151,7 @@ class Follower:
         last: "LastBelief",
         field_map: QueryableMap,
         robust: RobustOptions,
-        drift: DriftOptions,
+        over_m: float,
         *,
         free: bool,
         section: int = SECTION,
@@ -162,7 +161,7 @@ class Follower:
         pose = belief.pose
         T_map_lidar = as_transform(pose)
         start = StartPose(T_map_lidar, belief.pose_covariance)
-        own = cls(start, belief.sensors, field_map, robust, drift, free=free, section=section)
+        own = cls(start, belief.sensors, field_map, robust, over_m, free=free, section=section)
         values, sizes = gtsam.Values(), {X(number): POSE}
         values.insert(X(number), pose)
         if free:

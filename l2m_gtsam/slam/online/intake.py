@@ -81,14 +81,16 @@ class Intake:
         Calibrated sensors.
     options
         Of a localisation.
-    steady
-        Whether the estimator knows a steady drift of odometry; for others it is part of each step's
-        own error.
+    drift_axes
+        Ratio of a steady drift's standard deviation along each axis to that of `slam.drift`, (3,),
+        where the estimator knows one; for others it is part of each step's own error.
     """
 
-    def __init__(self, sensors: KnownSensors, options: SlamOptions, *, steady: bool) -> None:
+    def __init__(
+        self, sensors: KnownSensors, options: SlamOptions, drift_axes: FloatArray | None
+    ) -> None:
         self._known, self._options, self._online = sensors, options, options.online
-        self._steady = steady
+        self._drift_axes = drift_axes
         self._index = {name: i for i, name in enumerate(sensors.names)}
         self.state = IntakeState(sensors=[SensorBuffer() for _ in sensors.names])
         self._looked_at = 1
@@ -270,11 +272,12 @@ class Intake:
         options = self._options
         readings = self._placed(waiting, trajectory, rows)
         steps = odometry_steps(trajectory, rows, options.drift)
-        if self._steady:
-            steps = steps.with_scale_as_drift(options.drift.over_m)
-            steady = float(steady_share(options.drift, is_stated=steps.stated)[0])
+        if self._drift_axes is None:
+            steps, steady = steps.as_walk(options.drift.over_m), np.zeros(3)
         else:
-            steps, steady = steps.as_walk(options.drift.over_m), 0.0
+            steps = steps.with_scale_as_drift(options.drift.over_m)
+            share = steady_share(options.drift, is_stated=steps.stated)[0]
+            steady = share * self._drift_axes
         of_key_pose = key_pose_readings(readings, trajectory, rows)
         return ArrivedKeyPose(
             number,

@@ -5,7 +5,7 @@ drives (:mod:`.intake`). Readings between two key poses come with the second of 
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -64,9 +64,8 @@ class ArrivedKeyPose:
     fixed
         The step along fixed axes, where odometry knows it so.
     steady
-        Standard deviation of odometry's steady drift as a share of the distance, along all axes
-        alike: those of the one field are the first key pose's, of which none need be vertical. 0
-        for none.
+        Standard deviation of odometry's steady drift along each axis of the frame of the poses as a
+        share of the distance, shape (3,). 0 for none.
     recorded
         The same key pose by the step that odometry recorded, where this one goes on with the motion
         before, for the recorded step is far from it.
@@ -83,7 +82,7 @@ class ArrivedKeyPose:
     lost: bool = False
     scans: tuple[ScanAtKeyPose, ...] = ()
     fixed: FixedStep | None = None
-    steady: float = 0.0
+    steady: FloatArray = field(default_factory=lambda: np.zeros(3))
     recorded: "ArrivedKeyPose | None" = None
 
     @property
@@ -98,12 +97,12 @@ class ArrivedKeyPose:
 
     @property
     def steady_m(self) -> FloatArray:
-        """What one standard deviation of the drift adds to the step, with time and distance, (2,).
+        """What one standard deviation of the drift adds with time and with distance, m, (2, 3).
 
         All of it comes with distance: with half of it by time the errors on a model ship are the
         same, and the mean speed is not known yet.
         """
-        return np.array([0.0, self.steady * self.length_m])
+        return np.stack([np.zeros(3), self.steady * self.length_m])
 
     def without_readings(self) -> "ArrivedKeyPose":
         """Return it by odometry alone."""
@@ -150,7 +149,7 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
     """Return key poses, from the first on, as a drive."""
     steps = key_poses[1:]
     shifts = [each.fixed.shift for each in steps if each.fixed is not None]
-    steady = np.reshape([each.steady_m for each in steps], (-1, 2, 1)) * np.ones(3)
+    steady = np.reshape([each.steady_m for each in steps], (-1, 2, 3))
     return Drive(
         stamp_ns=np.array([each.stamp_ns for each in key_poses], dtype=np.int64),
         steps=OdometrySteps(

@@ -18,7 +18,7 @@ from l2m_gtsam.slam.online.tracked_drift import DriftPrior, TrackedDrift, WaySin
 
 Arrays = dict[str, npt.NDArray[Any]]
 LINKS = ("origin", "key_pose", "R", "p", "covariance")
-WAY = ("p", "p_covariance", "shift", "random")
+WAY = ("p", "p_covariance", "shift", "random", "drift_m")
 READINGS = ("key_pose", "sensor", "R_key_lidar", "p_key_lidar", "fraction", "field")
 
 
@@ -59,7 +59,7 @@ def packed_key_poses(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
         "R": np.reshape([each.R for each in key_poses], (-1, 3, 3)),
         "p": np.reshape([each.p for each in key_poses], (-1, 3)),
         "covariance": np.reshape([each.covariance for each in key_poses], (-1, 6, 6)),
-        "steady": np.array([each.steady for each in key_poses], dtype=np.float64),
+        "steady": np.reshape([each.steady for each in key_poses], (-1, 3)),
         "count": np.array([len(each.readings) for each in key_poses], dtype=np.int64),
         "reading_ns": np.concatenate(
             [np.empty(0, dtype=np.int64), *(each.reading_ns for each in key_poses)]
@@ -106,7 +106,7 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
                 arrays["reading_ns"][rows],
                 links[own],
                 fixed=step if np.isfinite(step.shift).all() else None,
-                steady=float(arrays["steady"][k]),
+                steady=np.broadcast_to(arrays["steady"][k], 3),  # older states have one
             )
         )
     return found
@@ -122,7 +122,8 @@ def packed_drift(tracked: TrackedDrift) -> Arrays:
         "p_covariance": way.covariance,
         "shift": way.shift,
         "random": way.random,
-        "length": np.array([way.drift_m, tracked.untold_m]),
+        "drift_m": way.drift_m,
+        "untold_m": np.array([tracked.untold_m]),
     }
 
 
@@ -132,10 +133,8 @@ def unpacked_drift(arrays: Arrays, over_m: float) -> TrackedDrift:
         DriftPrior(mean, covariance)
         for mean, covariance in zip(arrays["mean"], arrays["covariance"], strict=True)
     )
-    drift_m, untold_m = arrays["length"].tolist()
-    p, covariance, shift, random = (arrays[name] for name in WAY)
-    way = WaySinceAnchor(p, covariance, shift, random, drift_m)
-    return TrackedDrift(before, known, way, over_m, untold_m)
+    way = WaySinceAnchor(*(arrays[name] for name in WAY))
+    return TrackedDrift(before, known, way, over_m, float(arrays["untold_m"][0]))
 
 
 def packed_gaussian(known: JointGaussian) -> Arrays:

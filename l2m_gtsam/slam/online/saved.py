@@ -179,7 +179,7 @@ def _resume_following(slam: OnlineSlam, arrays: Arrays) -> None:
         LastBelief(int(arrays["number"][0]), belief, drift),
         slam.known_map(),
         options.robust,
-        options.drift,
+        options.drift.over_m,
         free=options.calibration is CalibrationUse.REFINED,
     )
 

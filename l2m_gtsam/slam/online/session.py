@@ -9,6 +9,8 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import CalibrationError, ConfigError
@@ -138,8 +140,9 @@ class OnlineSlam:
         self.options, self.sensors = options, known_sensors(usable)
         self._map = None if field_map is None else for_solvers(field_map)
         self.matcher = matcher
-        knows_drift = self._one_field or field_map is not None
-        self.intake = Intake(self.sensors, options, steady=knows_drift)
+        axes = None if field_map is None else np.array([1.0, 1.0, options.drift.of_height])
+        # The axes of the one field are the first key pose's, of which none need be vertical.
+        self.intake = Intake(self.sensors, options, np.ones(3) if self._one_field else axes)
         self.estimator: Follower | Explorer | OneFieldExplorer | None = None
         self.search: StartSearchState | None = None
         self.base, self.stamp_ns = 0, 0  # number of the first key pose, time of the last
@@ -223,8 +226,8 @@ class OnlineSlam:
 
     def _follower(self, start: StartPose) -> Follower:
         free, robust = self.options.calibration is CalibrationUse.REFINED, self.options.robust
-        drift = self.options.drift
-        return Follower(start, self.sensors, self.known_map(), robust, drift, free=free)
+        over_m = self.options.drift.over_m
+        return Follower(start, self.sensors, self.known_map(), robust, over_m, free=free)
 
     def known_map(self) -> QueryableMap:
         """Return the map.

@@ -6,7 +6,7 @@ pose from which on it is counted: what odometry says of it less what the map say
 for odometry's other errors and for those of both ends. These sums are all that is kept of a drive.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import eigh
@@ -50,14 +50,14 @@ class WaySinceAnchor:
     random
         Covariance of odometry's other errors over it, shape (3, 3).
     drift_m
-        What one standard deviation of the drift adds.
+        What one standard deviation of the drift along each axis adds, shape (3,).
     """
 
     p: FloatArray
     covariance: FloatArray
     shift: FloatArray
     random: FloatArray
-    drift_m: float = 0.0
+    drift_m: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def begun(cls, belief: Belief) -> "WaySinceAnchor":
@@ -90,19 +90,17 @@ class TrackedDrift:
     untold_m: float = 0.0
 
     @classmethod
-    def at_start(cls, of_height: float, over_m: float, belief: Belief) -> "TrackedDrift":
+    def at_start(cls, over_m: float, belief: Belief) -> "TrackedDrift":
         """Return a drift of which nothing is known but its standard deviation, at a first key pose.
 
         Parameters
         ----------
-        of_height
-            Ratio of its standard deviation along the third axis to that along the others.
         over_m
             As of the class.
         belief
             Of the first key pose.
         """
-        unknown = DriftPrior(np.zeros(3), np.diag([1.0, 1.0, of_height**2]))
+        unknown = DriftPrior(np.zeros(3), np.eye(3))
         return cls(unknown, unknown, WaySinceAnchor.begun(belief), over_m)
 
     def without(self, key_pose: ArrivedKeyPose, before: Belief) -> ArrivedKeyPose:
@@ -116,16 +114,17 @@ class TrackedDrift:
             Of the key pose before.
         """
         drift_m = drift_of(key_pose)
-        if not drift_m:
+        if not drift_m.any():
             return key_pose
         R = before.pose.rotation().matrix()
         to_end = (R @ key_pose.R).T
         # What is not known is the same all along: as a walk it has that variance after this way.
         over = max(self.over_m, self.untold_m) / key_pose.length_m
         covariance = key_pose.covariance.copy()
-        covariance[3:, 3:] += drift_m**2 * over * (to_end @ self.known.covariance @ to_end.T)
-        p = key_pose.p - drift_m * (R.T @ self.known.drift)
-        return replace(key_pose, p=p, covariance=covariance, steady=0.0)
+        left = drift_m[:, None] * self.known.covariance * drift_m
+        covariance[3:, 3:] += over * (to_end @ left @ to_end.T)
+        p = key_pose.p - R.T @ (drift_m * self.known.drift)
+        return replace(key_pose, p=p, covariance=covariance, steady=np.zeros(3))
 
     def moved(self, key_pose: ArrivedKeyPose, before: Belief) -> "TrackedDrift":
         """Return it after a step by odometry, arguments as of ``without``."""
@@ -155,18 +154,18 @@ class TrackedDrift:
     def _by_place(self, p: FloatArray, covariance: FloatArray) -> "TrackedDrift":
         """Return it with the place of the last key pose, with its covariance, m."""
         way, before = self.way, self.before
-        axes = np.flatnonzero(np.diag(before.covariance) > 0)
-        if not way.drift_m or not len(axes):
+        axes = np.flatnonzero(way.drift_m)
+        if not len(axes):
             return self
-        own = np.ix_(axes, axes)
+        own, w = np.ix_(axes, axes), way.drift_m[axes]
         ends = (covariance + way.covariance)[own]
-        prior = way.drift_m**2 * before.covariance[own]
+        prior = w[:, None] * before.covariance[own] * w
         # Along these directions both are diagonal: which of them are the map's?
         share, directions = eigh(ends, prior)
         along = directions[:, share < TOLD]
         off = (way.shift - (p - way.p) - way.drift_m * before.drift)[axes]
         S = along.T @ (prior + ends + way.random[own]) @ along
-        crossed = way.drift_m * (before.covariance[:, axes] @ along)
+        crossed = before.covariance[:, axes] * w @ along
         gain = np.linalg.solve(S, crossed.T).T
         known = DriftPrior(
             before.drift + gain @ (along.T @ off), before.covariance - gain @ crossed.T
@@ -175,8 +174,8 @@ class TrackedDrift:
         return replace(self, known=known, untold_m=untold_m)
 
 
-def drift_of(key_pose: ArrivedKeyPose) -> float:
-    """Return what one standard deviation of the drift adds to a step in metres."""
+def drift_of(key_pose: ArrivedKeyPose) -> FloatArray:
+    """Return what one standard deviation of the drift along each axis adds to a step, m, (3,)."""
     return key_pose.steady * key_pose.length_m
 
 

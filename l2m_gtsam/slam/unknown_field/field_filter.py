@@ -37,7 +37,8 @@ class FilterStep:
     readings
         n readings relative to its end, so that they correct the pose that is known then.
     steady
-        What a unit of a drift with time and with distance adds, metres, shape (2,).
+        What a unit of a drift with time and with distance adds, metres, shape (2,) along all axes
+        alike, or (2, 3).
     fixed
         The step along fixed axes, where odometry knows it so.
     """

@@ -104,7 +104,8 @@ def test_steps_without_the_drift_are_those_of_the_poses() -> None:
 
 def followed(drawn: DrawnDrive, seed: int, key_poses: Iterable[ArrivedKeyPose]) -> list[Belief]:
     drive, world = drawn.drive, dipole_world(seed)
-    follower = Follower(drive.start, drive.sensors, world, OPTIONS.robust, DRIFT, free=False)
+    robust, over_m = OPTIONS.robust, DRIFT.over_m
+    follower = Follower(drive.start, drive.sensors, world, robust, over_m, free=False)
     return [follower.add(each) for each in key_poses]
 
 
@@ -117,7 +118,7 @@ def test_on_line_the_drift_is_found_as_the_vehicle_drives() -> None:
     for seed in SEEDS:
         drawn, _ = drifting(seed)
         walk = key_poses_of(drawn.drive.as_walk(DRIFT.over_m))
-        steady = (replace(each, steady=SHARE) for each in key_poses_of(drawn.drive))
+        steady = (replace(each, steady=np.full(3, SHARE)) for each in key_poses_of(drawn.drive))
         for number, key_poses in enumerate((walk, steady)):
             beliefs = followed(drawn, seed, key_poses)
             late = slice(len(beliefs) // 3, None)

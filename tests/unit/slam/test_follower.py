@@ -152,8 +152,8 @@ def test_a_field_that_bends_does_not_lead_astray() -> None:
 def test_what_a_key_pose_costs_does_not_grow() -> None:
     """The map is asked as often late in a drive as early, once the calibration has settled."""
     field_map, drive = CountingMap(WORLD), drawn(40.0).drive
-    start, robust, drift = drive.start, RobustOptions(), DriftOptions()
-    follower = Follower(start, drive.sensors, field_map, robust, drift, free=True, section=20)
+    start, robust, over_m = drive.start, RobustOptions(), DriftOptions().over_m
+    follower = Follower(start, drive.sensors, field_map, robust, over_m, free=True, section=20)
     asked = []
     for key_pose in key_poses_of(drive):
         follower.add(key_pose)

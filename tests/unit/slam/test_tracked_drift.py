@@ -39,15 +39,15 @@ def way_of(seed: int, of_height: float = 1.0, seconds: float = 30.0) -> Way:
     rng, every = np.random.default_rng(seed), rounds(seconds)
     path = every[np.arange(0, len(every), 2)]
     truth = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(path.R, path.p, strict=True)]
-    drift = np.array([1.0, 1.0, of_height]) * rng.normal(size=3)
+    drift, steady = rng.normal(size=3), SHARE * np.array([1.0, 1.0, of_height])
     first = ArrivedKeyPose.first(int(path.stamp_ns[0]), Links.none())
     covariance = np.diag([1e-10] * 3 + [STEP_M**2] * 3)
     found = [first]
     for number, (a, b) in enumerate(pairwise(truth), start=1):
         step, R = a.between(b), a.rotation().matrix()
-        drifted = step.translation() + R.T @ (SHARE * drift * np.linalg.norm(step.translation()))
+        drifted = step.translation() + R.T @ (steady * drift * np.linalg.norm(step.translation()))
         p = drifted + step.rotation().matrix() @ rng.normal(0, STEP_M, 3)
-        own = replace(first, number=number, R=step.rotation().matrix(), p=p, steady=SHARE)
+        own = replace(first, number=number, R=step.rotation().matrix(), p=p, steady=steady)
         found.append(replace(own, covariance=covariance))
     return Way(found, truth, drift)
 
@@ -63,8 +63,8 @@ def told(way: Way, seed: int) -> Iterator[Belief]:
         yield belief_at(pose.retract(np.append(np.zeros(3), rng.normal(0, TOLD_M, 3))), TOLD_M)
 
 
-def tracked(way: Way, beliefs: list[Belief], of_height: float = 1.0) -> TrackedDrift:
-    found = TrackedDrift.at_start(of_height, OVER_M, beliefs[0])
+def tracked(way: Way, beliefs: list[Belief]) -> TrackedDrift:
+    found = TrackedDrift.at_start(OVER_M, beliefs[0])
     for before, now, key_pose in zip(beliefs, beliefs[1:], way.key_poses[1:], strict=False):
         found = found.moved(key_pose, before).seen(now)
     return found
@@ -87,7 +87,7 @@ def test_the_drift_is_as_near_as_it_says() -> None:
 def test_places_that_follow_odometry_tell_nothing(seed: int) -> None:
     """A vehicle without readings: its place is odometry's, as uncertain as the drift makes it."""
     way, beliefs = way_of(seed), [belief_at(gtsam.Pose3(), TOLD_M)]
-    found = TrackedDrift.at_start(1.0, OVER_M, beliefs[0])
+    found = TrackedDrift.at_start(OVER_M, beliefs[0])
     for key_pose in way.key_poses[1:]:
         expected = found.without(key_pose, beliefs[-1])
         predicted = beliefs[-1].predicted(expected.step, expected.covariance)
@@ -105,29 +105,31 @@ def test_a_step_loses_what_is_known_of_the_drift() -> None:
     last = way.key_poses[-1]
     true = way.truth[-2].between(way.truth[-1]).translation()
     without = found.without(last, before)
-    assert without.steady == 0.0
+    assert not without.steady.any()
     R = way.truth[-2].rotation().matrix()
     removed = last.p - without.p
     np.testing.assert_allclose(R @ removed, SHARE * last.length_m * found.known.drift, atol=1e-12)
     assert np.linalg.norm(without.p - true) < 5 * STEP_M
     # By steps of such errors it is known to these over the root of the way, and counts over 10 m.
     more = np.trace((without.covariance - last.covariance)[3:, 3:])
-    left = OVER_M * SHARE / found.way.drift_m * np.trace(last.covariance[3:, 3:])
+    left = OVER_M * SHARE / found.way.drift_m[0] * np.trace(last.covariance[3:, 3:])
     assert more == pytest.approx(left, rel=0.2)
 
 
 def test_steps_without_a_drift_stay_as_they_are() -> None:
     way = way_of(4)
     found = tracked(way, list(told(way, 4)))
-    stated = replace(way.key_poses[-1], steady=0.0)
+    stated = replace(way.key_poses[-1], steady=np.zeros(3))
     assert found.without(stated, belief_at(way.truth[-2], TOLD_M)) is stated
 
 
 def test_on_an_even_floor_nothing_drifts_upwards() -> None:
     way = way_of(5, of_height=0.0)
-    found = tracked(way, list(told(way, 5)), of_height=0.0)
+    found = tracked(way, list(told(way, 5)))
     assert found.known.drift[2] == 0.0
-    assert not found.known.covariance[2].any()
+    expected = found.without(way.key_poses[-1], belief_at(way.truth[-2], TOLD_M))
+    R, more = way.truth[-1].rotation().matrix(), expected.covariance - way.key_poses[-1].covariance
+    np.testing.assert_allclose((R @ more[3:, 3:] @ R.T)[2], 0.0, atol=1e-16)
     np.testing.assert_allclose(found.known.drift[:2], way.drift[:2], atol=0.3)
 
 
@@ -139,7 +141,7 @@ def test_after_a_motion_that_odometry_lost_the_drift_is_still_known() -> None:
     away = belief_at(way.truth[-1].compose(gtsam.Pose3(gtsam.Rot3(), [5.0, 0.0, 0.0])), TOLD_M)
     anew = found.anchored(away)
     np.testing.assert_array_equal(anew.known.drift, found.known.drift)
-    assert anew.way.drift_m == 0.0
+    assert not anew.way.drift_m.any()
     on = anew.moved(way.key_poses[-1], away).seen(away)
     sigma = np.sqrt(np.diag(found.known.covariance))
     assert (np.abs(on.known.drift - found.known.drift) < 2 * sigma).all()
