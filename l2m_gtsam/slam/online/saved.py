@@ -37,6 +37,7 @@ from l2m_gtsam.slam.online.packing import (
 from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
 from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
 from l2m_gtsam.slam.online.session import OnlineSlam, StartSearchState
+from l2m_gtsam.slam.online.tracked_drift import TrackedDrift
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExplorerState, MarginalizedPose
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile
@@ -174,12 +175,14 @@ def _resume_following(slam: OnlineSlam, arrays: Arrays) -> None:
     sensors = replace(slam.sensors, t=arrays["t"], distortion=arrays["distortion"])
     belief = Belief(unpacked_poses(arrays)[0], sensors, arrays["covariance"])
     options = slam.options
-    drift = unpacked_drift(under("drift", arrays), options.drift.over_m)
+    over_m, own = options.drift.over_m, under("drift", arrays)
+    # Older states have none: it is found again.
+    drift = unpacked_drift(own, over_m) if own else TrackedDrift.at_start(over_m, belief)
     slam.estimator = Follower.resumed(
         LastBelief(int(arrays["number"][0]), belief, drift),
         slam.known_map(),
         options.robust,
-        options.drift.over_m,
+        over_m,
         free=options.calibration is CalibrationUse.REFINED,
     )
 

@@ -270,6 +270,24 @@ def test_killed_and_resumed_it_goes_on(
     assert (np.abs(whole.p - expected.p) / sigma).max() < 0.1
 
 
+def test_a_state_that_knows_no_steady_drift_goes_on(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    """As it was saved before the drift was followed."""
+    sensors, drive = hall
+    given = list(messages(drive.recording))
+    slam, half = in_map(hall), len(given) // 2
+    driven(slam, given[:half])
+    state = saved_state(slam)
+    arrays = {k: v for k, v in state.arrays.items() if not k.startswith("belief.drift.")}
+    assert len(arrays) < len(state.arrays)
+    run = driven(
+        resumed_slam(SavedState(arrays, state.facts), calibrated(sensors), OPTIONS, WORLD),
+        given[half:],
+    )
+    assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.06
+
+
 def test_a_state_of_something_else_is_refused(
     hall: tuple[tuple[KnownSensor, ...], SlamDrive], tmp_path: Path
 ) -> None:
