@@ -198,7 +198,7 @@ class Follower:
         CalibrationError
             The system is too badly scaled to be solved.
         """
-        number, told = key_pose.number, self.used
+        number, used = key_pose.number, self.used
         if number > 0:
             self._advance(key_pose)
         is_fixed = self._update_by_fixes(key_pose.links)
@@ -209,7 +209,7 @@ class Follower:
             self._update_section()
         if key_pose.lost or key_pose.recorded is not None:
             self._drift = self._drift.anchored(self._belief)
-        elif is_fixed or self.used > told:
+        elif is_fixed or self.used > used:
             self._drift = self._drift.seen(self._belief)
         return self._belief
 

@@ -123,7 +123,7 @@ def packed_drift(tracked: TrackedDrift) -> Arrays:
         "shift": way.shift,
         "random": way.random,
         "drift_m": way.drift_m,
-        "untold_m": np.array([tracked.untold_m]),
+        "unobserved_m": np.array([tracked.unobserved_m]),
     }
 
 
@@ -134,7 +134,7 @@ def unpacked_drift(arrays: Arrays, over_m: float) -> TrackedDrift:
         for mean, covariance in zip(arrays["mean"], arrays["covariance"], strict=True)
     )
     way = WaySinceAnchor(*(arrays[name] for name in WAY))
-    return TrackedDrift(before, known, way, over_m, float(arrays["untold_m"][0]))
+    return TrackedDrift(before, known, way, over_m, float(arrays["unobserved_m"][0]))
 
 
 def packed_gaussian(known: JointGaussian) -> Arrays:

@@ -17,7 +17,8 @@ from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 
 # Share of the drift's variance over a way, below which errors of its ends are what the map leaves.
 # Places that follow odometry err with the drift itself, as much as it is not known.
-TOLD = 0.1
+OBSERVED = 0.1
+ROUNDING = 1e-9  # of the drift's variance: it is known no better, so that matrices stay positive
 BETTER = 0.25  # times the variance of the anchor: another one is worth beginning anew
 
 
@@ -79,15 +80,15 @@ class TrackedDrift:
         Since the anchor.
     over_m
         The least distance over which it counts as a random walk of the same variance, metres.
-    untold_m
-        Path since the map last told the place along all axes.
+    unobserved_m
+        Path since the map last determined the place along all axes.
     """
 
     before: DriftPrior
     known: DriftPrior
     way: WaySinceAnchor
     over_m: float
-    untold_m: float = 0.0
+    unobserved_m: float = 0.0
 
     @classmethod
     def at_start(cls, over_m: float, belief: Belief) -> "TrackedDrift":
@@ -119,7 +120,7 @@ class TrackedDrift:
         R = before.pose.rotation().matrix()
         to_end = (R @ key_pose.R).T
         # What is not known is the same all along: as a walk it has that variance after this way.
-        over = max(self.over_m, self.untold_m) / key_pose.length_m
+        over = max(self.over_m, self.unobserved_m) / key_pose.length_m
         covariance = key_pose.covariance.copy()
         left = drift_m[:, None] * self.known.covariance * drift_m
         covariance[3:, 3:] += over * (to_end @ left @ to_end.T)
@@ -137,10 +138,10 @@ class TrackedDrift:
             random=way.random + random,
             drift_m=way.drift_m + drift_of(key_pose),
         )
-        return replace(self, way=longer, untold_m=self.untold_m + key_pose.length_m)
+        return replace(self, way=longer, unobserved_m=self.unobserved_m + key_pose.length_m)
 
     def seen(self, belief: Belief) -> "TrackedDrift":
-        """Return it with what the place of the last key pose says, which readings have told."""
+        """Return it with what the place of the last key pose says, which readings determine."""
         p, covariance = place_of(belief)
         found = self._by_place(p, covariance)
         if np.trace(covariance) < BETTER * np.trace(self.way.covariance):
@@ -149,7 +150,8 @@ class TrackedDrift:
 
     def anchored(self, belief: Belief) -> "TrackedDrift":
         """Return the same counted from a key pose on, as after a motion that odometry lost."""
-        return replace(self, before=self.known, way=WaySinceAnchor.begun(belief))
+        before = replace(self.known, covariance=self.known.covariance + ROUNDING * np.eye(3))
+        return replace(self, before=before, way=WaySinceAnchor.begun(belief))
 
     def _by_place(self, p: FloatArray, covariance: FloatArray) -> "TrackedDrift":
         """Return it with the place of the last key pose, with its covariance, m."""
@@ -162,7 +164,7 @@ class TrackedDrift:
         prior = w[:, None] * before.covariance[own] * w
         # Along these directions both are diagonal: which of them are the map's?
         share, directions = eigh(ends, prior)
-        along = directions[:, share < TOLD]
+        along = directions[:, share < OBSERVED]
         off = (way.shift - (p - way.p) - way.drift_m * before.drift)[axes]
         S = along.T @ (prior + ends + way.random[own]) @ along
         crossed = before.covariance[:, axes] * w @ along
@@ -170,8 +172,8 @@ class TrackedDrift:
         known = DriftPrior(
             before.drift + gain @ (along.T @ off), before.covariance - gain @ crossed.T
         )
-        untold_m = 0.0 if len(axes) == along.shape[1] else self.untold_m
-        return replace(self, known=known, untold_m=untold_m)
+        unobserved_m = 0.0 if len(axes) == along.shape[1] else self.unobserved_m
+        return replace(self, known=known, unobserved_m=unobserved_m)
 
 
 def drift_of(key_pose: ArrivedKeyPose) -> FloatArray:
