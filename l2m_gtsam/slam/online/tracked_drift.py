@@ -18,7 +18,6 @@ from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 # Share of the drift's variance over a way, below which errors of its ends are what the map leaves.
 # Places that follow odometry err with the drift itself, as much as it is not known.
 OBSERVED = 0.1
-ROUNDING = 1e-9  # of the drift's variance: it is known no better, so that matrices stay positive
 BETTER = 0.25  # times the variance of the anchor: another one is worth beginning anew
 
 
@@ -150,8 +149,7 @@ class TrackedDrift:
 
     def anchored(self, belief: Belief) -> "TrackedDrift":
         """Return the same counted from a key pose on, as after a motion that odometry lost."""
-        before = replace(self.known, covariance=self.known.covariance + ROUNDING * np.eye(3))
-        return replace(self, before=before, way=WaySinceAnchor.begun(belief))
+        return replace(self, before=self.known, way=WaySinceAnchor.begun(belief))
 
     def _by_place(self, p: FloatArray, covariance: FloatArray) -> "TrackedDrift":
         """Return it with the place of the last key pose, with its covariance, m."""

@@ -147,17 +147,6 @@ def test_after_a_motion_that_odometry_lost_the_drift_is_still_known() -> None:
     assert (np.abs(on.known.drift - found.known.drift) < 2 * sigma).all()
 
 
-def test_exact_places_leave_no_matrix_negative() -> None:
-    """Anchored anew at every key pose, each of which is known to a nanometre."""
-    way = way_of(8, seconds=5.0)
-    exact = [belief_at(pose, 1e-9) for pose in way.truth]
-    found = TrackedDrift.at_start(OVER_M, exact[0])
-    for before, now, key_pose in zip(exact, exact[1:], way.key_poses[1:], strict=False):
-        noiseless = replace(key_pose, covariance=1e-18 * np.eye(6))
-        found = found.moved(noiseless, before).seen(now).anchored(now)
-    assert np.linalg.eigvalsh(found.before.covariance).min() > 0
-
-
 def test_a_drift_is_saved() -> None:
     way = way_of(7)
     found = tracked(way, list(told(way, 7)))
