@@ -35,8 +35,13 @@ from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
     JumpDecision,
     step_of,
 )
-from l2m_gtsam.slam.unknown_field.smoothed_drive import SmoothedDrive, smoothed
-from l2m_gtsam.slam.unknown_field.whole_field import WholePrior, capped_prior, spectrum_at
+from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, SmoothedDrive, smoothed
+from l2m_gtsam.slam.unknown_field.whole_field import (
+    COARSE,
+    WholePrior,
+    capped_prior,
+    spectrum_at,
+)
 from l2m_gtsam.solve.chi_square import exceeded_by
 
 # Of the filter's noise. Slow errors count as white there: of errors that last 3 to 4 s, with a
@@ -46,7 +51,6 @@ from l2m_gtsam.solve.chi_square import exceeded_by
 NOISE_FACTOR = 4.0
 GROWN = 2.0  # path, after which the drive is solved again: all of it takes twice the last solution
 LEFT = 1.25  # the same where the vehicle has left the box, or a correction was refused
-ROUNDS = (1, 1, 2)  # of the solution's stages; with as many as off line poses are no better
 NEAR = 1.0  # lengths of the field, to the faces of the box: nearer, these matter
 IMPOSSIBLE = float(exceeded_by(1e-6, POSE))  # squared distance from odometry in its sigmas
 LEAST, MOST = 20, 1500  # key poses that are solved as a whole; a round of 350 takes two seconds
@@ -285,13 +289,14 @@ class OneFieldExplorer:
             return
         options, everything = self._options.whole_field, self._drive(len(self._key_poses))
         first, poses = None if now is None else now.prior.spectrum, self.poses()
-        spectrum = spectrum_at(everything, poses, options, first)
+        spectrum = spectrum_at(everything, poses, options, COARSE, first)
         yield None
-        yield from self._following(capped_prior(everything, poses, options, spectrum), None)
+        prior = capped_prior(everything, poses, options, spectrum, COARSE)
+        yield from self._following(prior, None)
 
     def _smoothing(self, drive: Drive) -> Generator[None, None, SmoothedDrive | None]:
         """Solve a drive in pieces; return None where the field has too much detail for that."""
-        work = smoothed(drive, drive.dead_reckoning(), self._options, ROUNDS)
+        work = smoothed(drive, drive.dead_reckoning(), self._options, ON_LINE)
         while True:
             try:
                 next(work)

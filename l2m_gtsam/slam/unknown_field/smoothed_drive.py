@@ -11,7 +11,7 @@ take it up. The filter has the offset alone free: it meets field and distortion 
 unknowns, which it could linearise at nothing better than zero.
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -19,22 +19,51 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.drive import Drive, KnownSensors, as_pose
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, WholeFieldOptions
 from l2m_gtsam.slam.solver import weights_last
 from l2m_gtsam.slam.unknown_field.forward_pass import FollowedDrive, followed
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
+from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.tiled_smoother import TiledProblem, TiledRound
-from l2m_gtsam.slam.unknown_field.whole_field import WholePrior, learnt_prior
+from l2m_gtsam.slam.unknown_field.whole_field import WholePrior, fine_prior, learnt_prior
 
 CONVEX = 1.0  # of the loss, with weights at the poses of the filter
 # Factors of the noise. With the noise alone the likelihood has maxima between the poses of odometry
 # and the best ones, and a filter that linearises once is led to one of them: on the model ship it
 # finds back with 3 to 8 times the noise, and ends up to 5 m off with the noise alone.
 FOLLOWED = (2.0, 4.0)  # of the filter's passes, the first at odometry's poses
-STAGES = (4.0, 2.0, 1.0)  # of the smoother's stages
-ROUNDS = (2, 2, 3)  # of each: readings are hung and weighed anew at the poses
-ITERATIONS = 4  # of each round
 CLOSE = 0.5  # decrease of the error that moves poses by less than their sigmas
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the smoother.
+
+    Attributes
+    ----------
+    noise_factor
+        The noise of readings that counts, over that which is learnt.
+    rounds
+        Readings are hung and weighed anew at the poses in each.
+    iterations
+        The most of each round.
+    learn
+        Learns the field before it, at the poses found so far.
+    """
+
+    noise_factor: float
+    rounds: int
+    iterations: int
+    learn: Callable[
+        [Drive, list[gtsam.Pose3], WholeFieldOptions, FieldSpectrum], WholePrior | None
+    ] = learnt_prior
+
+
+# The field is fine in the end, where poses are within its short waves, and that stage has to
+# converge: after four iterations poses of a sensor in the hand are up to four times as far off.
+OFF_LINE = (Stage(4.0, 2, 4), Stage(2.0, 2, 4), Stage(1.0, 3, 30, fine_prior))
+# On line neither a fine field nor more rounds gain anything: the filter goes on with coarse poses.
+ON_LINE = (Stage(4.0, 1, 4), Stage(2.0, 1, 4), Stage(1.0, 2, 4))
 
 
 @dataclass(frozen=True)
@@ -89,7 +118,7 @@ def smoothed(
     drive: Drive,
     initial: list[gtsam.Pose3],
     options: SlamOptions,
-    rounds: Sequence[int] = ROUNDS,
+    stages: Sequence[Stage] = OFF_LINE,
 ) -> Generator[float, None, SmoothedDrive | None]:
     """Solve a drive with one field, in pieces; yield the share that is done before each.
 
@@ -101,14 +130,14 @@ def smoothed(
         K key poses by odometry.
     options
         How to solve.
-    rounds
-        Of each stage: readings are hung and weighed anew at the poses.
+    stages
+        Of the smoother, after the filter.
 
     Returns
     -------
     None where the field has more detail than one basis holds.
     """
-    whole, count = options.whole_field, 2 + sum(rounds)
+    whole, count = options.whole_field, 2 + sum(each.rounds for each in stages)
     yield 0.0
     first = learnt_prior(drive, initial, whole)
     yield 1 / count
@@ -117,20 +146,21 @@ def smoothed(
         return None
     free = replace(drive, sensors=drive.sensors.loosened(whole.distortion, whole.offset))
     poses, sensors, prior, done = learnt.poses, free.sensors, learnt.prior, 2
-    for number, (factor, times) in enumerate(zip(STAGES, rounds, strict=True)):
+    for number, each in enumerate(stages):
         if number > 0:
             yield done / count
-            following = learnt_prior(drive, poses, whole, prior.spectrum)
+            following = each.learn(drive, poses, whole, prior.spectrum)
             if following is None:
                 return None
             prior = following
-        noise = prior.spectrum.noise.floored().scaled(factor)
-        problem, sensors = stage_problem(free, prior, noise, options), with_noise(sensors, noise)
-        for _ in range(times):
+        noise = prior.spectrum.noise.floored().scaled(each.noise_factor)
+        problem = stage_problem(free, prior, noise, options, each.iterations)
+        sensors = with_noise(sensors, noise)
+        for _ in range(each.rounds):
             yield done / count
-            stage, done = solved_stage(problem, poses, sensors), done + 1
-            poses, sensors = stage.last.poses, stage.last.sensors
-    return SmoothedDrive(free, problem, stage, prior, noise, first)
+            solved, done = solved_stage(problem, poses, sensors), done + 1
+            poses, sensors = solved.last.poses, solved.last.sensors
+    return SmoothedDrive(free, problem, solved, prior, noise, first)
 
 
 def with_noise(sensors: KnownSensors, noise: SensorNoise) -> KnownSensors:
@@ -139,11 +169,14 @@ def with_noise(sensors: KnownSensors, noise: SensorNoise) -> KnownSensors:
 
 
 def stage_problem(
-    drive: Drive, prior: WholePrior, noise: SensorNoise, options: SlamOptions
+    drive: Drive, prior: WholePrior, noise: SensorNoise, options: SlamOptions, iterations: int
 ) -> TiledProblem:
-    """Return the graph of a whole drive in one field, with such noise of its sensor."""
+    """Return the graph of a whole drive in one field, with such noise of its sensor.
+
+    Each round of it takes so many iterations at most.
+    """
     refined = options.model_copy(
-        update={"calibration": CalibrationUse.REFINED, "max_iterations": ITERATIONS}
+        update={"calibration": CalibrationUse.REFINED, "max_iterations": iterations}
     )
     slow = SlowErrors(noise, drive.stamp_ns, drive.reading_ns)
     heard = replace(drive, sensors=with_noise(drive.sensors, noise))

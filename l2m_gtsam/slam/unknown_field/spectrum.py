@@ -23,7 +23,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, whiten
 
-LEARNT_FROM, LEARNT_WITH = 300, 200  # readings and waves
+LEARNT_FROM = 300  # readings
 MARGIN = 1.5  # of the box about the path, in lengths of the field: on its faces the field is normal
 NEWTON, HALVINGS = 8, 20
 EVALUATIONS, AGAIN = 100, 50  # of the likelihood, and where it was searched before
@@ -85,6 +85,7 @@ def learnt_spectrum(
     readings: LearntReadings,
     distortion: float,
     offset_ut: float,
+    eigenfunctions: int,
     first: FieldSpectrum | None = None,
 ) -> FieldSpectrum:
     """Return the hyperparameters of the largest marginal likelihood.
@@ -95,10 +96,12 @@ def learnt_spectrum(
         At an estimate of their places.
     distortion, offset_ut
         Standard deviations of what calibrations leave of C and, in uT, of H.
+    eigenfunctions
+        How many. What shorter ones would hold counts as noise.
     first
         Where to begin.
     """
-    likelihood = SpectrumLikelihood(readings, distortion, offset_ut)
+    likelihood = SpectrumLikelihood(readings, distortion, offset_ut, eigenfunctions)
     start = FIRST if first is None else first.at
 
     def cost(at: FloatArray) -> float:
@@ -128,13 +131,15 @@ def learnt_spectrum(
 class SpectrumLikelihood:
     """The marginal likelihood of readings; parameters as of ``learnt_spectrum``."""
 
-    def __init__(self, readings: LearntReadings, distortion: float, offset_ut: float) -> None:
+    def __init__(
+        self, readings: LearntReadings, distortion: float, offset_ut: float, eigenfunctions: int
+    ) -> None:
         x, b, self._count = readings.x, readings.field, len(readings.x)
         level = np.einsum("nij,nj->ni", readings.R, b)
         self._strength = float(np.sqrt(np.mean((level - level.mean(axis=0)) ** 2)))
         first = PotentialHyperparameters(sigma=self._strength, length=1.0)
         low, high = x.min(axis=0) - MARGIN, x.max(axis=0) + MARGIN
-        self._basis = PotentialBasis.over(low, high, first, LEARNT_WITH)
+        self._basis = PotentialBasis.over(low, high, first, eigenfunctions)
         self._seconds = readings.seconds
         # Side by side, so that both are made white at once: features of the waves, and derivatives
         # of the corrected readings by A and h.

@@ -29,7 +29,28 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile, TiledDrive
 from l2m_gtsam.slam.unknown_field.tiles import Anchoring, relative_place
 
 LEAST_WAVES = 50
-CUT = 3.0  # waves shorter than the length over this count as noise
+
+
+@dataclass(frozen=True)
+class FieldDetail:
+    """How much of a field's detail counts as field; the rest counts as noise.
+
+    Attributes
+    ----------
+    learnt_with
+        Eigenfunctions by which strength, length and noise are learnt.
+    cut
+        Eigenfunctions count whose wave number is less than this over the field's length.
+    """
+
+    learnt_with: int
+    cut: float
+
+
+# A tenth of a field's variance is beyond 3 over its length, and a hundredth beyond 4. At poses that
+# are off by as much as short waves are long, these lead astray; at good poses, what they are not
+# there to explain counts as noise that fits better where poses are wrong.
+COARSE, FINE = FieldDetail(200, 3.0), FieldDetail(600, 4.0)
 
 
 @dataclass(frozen=True)
@@ -117,7 +138,7 @@ def learnt_prior(
     options: WholeFieldOptions,
     first: FieldSpectrum | None = None,
 ) -> WholePrior | None:
-    """Learn the prior of one field from a drive at an estimate of its poses.
+    """Learn the prior of one coarse field from a drive at an estimate of its poses.
 
     Parameters
     ----------
@@ -134,18 +155,31 @@ def learnt_prior(
     -------
     The prior; None where the field has more detail than so many eigenfunctions hold.
     """
-    return prior_about(drive, poses, options, spectrum_at(drive, poses, options, first))
+    return prior_about(drive, poses, options, spectrum_at(drive, poses, options, COARSE, first))
+
+
+def fine_prior(
+    drive: Drive,
+    poses: list[gtsam.Pose3],
+    options: WholeFieldOptions,
+    first: FieldSpectrum | None = None,
+) -> WholePrior:
+    """Learn the prior of a fine field, for good poses; parameters as of ``learnt_prior``."""
+    return capped_prior(
+        drive, poses, options, spectrum_at(drive, poses, options, FINE, first), FINE
+    )
 
 
 def spectrum_at(
     drive: Drive,
     poses: list[gtsam.Pose3],
     options: WholeFieldOptions,
+    detail: FieldDetail,
     first: FieldSpectrum | None = None,
 ) -> FieldSpectrum:
     """Learn what field and noise are like at an estimate of the poses.
 
-    Parameters as of ``learnt_prior``.
+    Other parameters as of ``learnt_prior``.
     """
     where = placed(drive, poses)
     x, R = where.x, where.readings.R_map_lidar
@@ -153,33 +187,40 @@ def spectrum_at(
     corrected = np.einsum("nji,nj->ni", R, where.field(drive.sensors))
     seconds = 1e-9 * (drive.reading_ns - drive.stamp_ns[0])
     readings = LearntReadings(x[few], R[few], corrected[few], seconds[few])
-    return learnt_spectrum(readings, options.distortion, options.offset, first)
+    return learnt_spectrum(readings, options.distortion, options.offset, detail.learnt_with, first)
 
 
 def prior_about(
     drive: Drive, poses: list[gtsam.Pose3], options: WholeFieldOptions, spectrum: FieldSpectrum
 ) -> WholePrior | None:
-    """Return the prior of one field about an estimate of the poses, of what was learnt at another.
+    """Return the prior of a coarse field about an estimate of the poses, learnt at another.
 
     Parameters and result as of ``learnt_prior``.
     """
-    prior = full_prior(drive, poses, spectrum)
+    prior = full_prior(drive, poses, spectrum, COARSE)
     return prior if prior.waves <= options.waves else None
 
 
 def capped_prior(
-    drive: Drive, poses: list[gtsam.Pose3], options: WholeFieldOptions, spectrum: FieldSpectrum
+    drive: Drive,
+    poses: list[gtsam.Pose3],
+    options: WholeFieldOptions,
+    spectrum: FieldSpectrum,
+    detail: FieldDetail,
 ) -> WholePrior:
-    """Return the same of a field with any detail: what shorter waves hold counts as noise."""
-    prior = full_prior(drive, poses, spectrum)
+    """Return the prior of a field with any detail: what shorter waves hold counts as noise."""
+    prior = full_prior(drive, poses, spectrum, detail)
     return replace(prior, waves=min(prior.waves, options.waves))
 
 
-def full_prior(drive: Drive, poses: list[gtsam.Pose3], spectrum: FieldSpectrum) -> WholePrior:
+def full_prior(
+    drive: Drive, poses: list[gtsam.Pose3], spectrum: FieldSpectrum, detail: FieldDetail
+) -> WholePrior:
     """Return the prior in a box about the poses with all waves that the field needs."""
     x, margin = placed(drive, poses).x, MARGIN * spectrum.prior.length
     low, high = x.min(axis=0) - margin, x.max(axis=0) + margin
-    return WholePrior(spectrum, low, high, waves_for(high - low, spectrum.prior.length))
+    waves = waves_for(high - low, detail.cut / spectrum.prior.length)
+    return WholePrior(spectrum, low, high, waves)
 
 
 def placed(drive: Drive, poses: list[gtsam.Pose3]) -> PlacedReadings:
@@ -188,9 +229,9 @@ def placed(drive: Drive, poses: list[gtsam.Pose3]) -> PlacedReadings:
     return place_readings(drive.readings, relative, drive.sensors)
 
 
-def waves_for(size: FloatArray, length: float) -> int:
-    """Return how many eigenfunctions of a box hold most of a field's variance."""
-    cut, a = CUT / length, np.pi / size
+def waves_for(size: FloatArray, cut: float) -> int:
+    """Return how many eigenfunctions of a box have a wave number below a cut, rad/m."""
+    a = np.pi / size
     axes = [np.arange(1, each + 1) for each in np.floor(cut / a).astype(int) + 1]
     squared = sum((n * each) ** 2 for n, each in zip(np.ix_(*axes), a, strict=True))
     return max(int(np.count_nonzero(squared <= cut**2)), LEAST_WAVES)

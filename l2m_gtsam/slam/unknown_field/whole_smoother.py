@@ -25,7 +25,7 @@ from l2m_gtsam.slam.unknown_field.path_information import path_information
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.smoothed_drive import (
     FOLLOWED,
-    ROUNDS,
+    OFF_LINE,
     SmoothedDrive,
     SolvedStage,
     followed_with,
@@ -36,7 +36,12 @@ from l2m_gtsam.slam.unknown_field.smoothed_drive import (
 )
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.tiled_smoother import AWAY_M, FieldSolution
-from l2m_gtsam.slam.unknown_field.whole_field import WholePrior, learnt_prior, prior_about
+from l2m_gtsam.slam.unknown_field.whole_field import (
+    WholePrior,
+    fine_prior,
+    learnt_prior,
+    prior_about,
+)
 
 HELD = 1e-3  # of odometry's sigmas: steps that are known so well leave the poses where they are
 SETTLED = 1.0  # movement of the poses in the last round, in their sigmas
@@ -66,10 +71,7 @@ def map_whole_drive(
     found = reported(smoothed(drive, initial, options), progress)
     if found is None:
         return None
-    learnt = learnt_prior(drive, found.stage.last.poses, options.whole_field, found.prior.spectrum)
-    if learnt is None:
-        return None
-    solution = where_gained(drive, found, learnt, options)
+    solution = where_gained(drive, found, options)
     progress("solving poses and field", 1.0)
     return solution
 
@@ -86,23 +88,21 @@ def reported(
             return found
 
 
-def where_gained(
-    drive: Drive, smooth: SmoothedDrive, learnt: WholePrior, options: SlamOptions
-) -> FieldSolution:
+def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> FieldSolution:
     """Return a solved drive; where nothing is shown to be gained, at the poses of odometry.
 
     Parameters
     ----------
     drive, smooth
         The drive, and its solution.
-    learnt
-        Of field and noise at the poses found.
     options
         How to solve.
     """
-    last = smooth.stage.last
+    last, whole = smooth.stage.last, options.whole_field
     found = with_information(smooth.problem.finished(last), last.values, smooth.prior, smooth.noise)
-    likelier = learnt.spectrum.log_likelihood - smooth.first.spectrum.log_likelihood
+    learnt = fine_prior(drive, last.poses, whole, smooth.prior.spectrum)
+    before = fine_prior(drive, drive.dead_reckoning(), whole, smooth.first.spectrum)
+    likelier = learnt.spectrum.log_likelihood - before.spectrum.log_likelihood
     likelier -= found.solution.bent
     gain = gain_of(found.solution.poses, drive.dead_reckoning(), found.marginals, likelier)
     if gain.shown:
@@ -110,7 +110,7 @@ def where_gained(
         ending = Ending.TOLERANCE if settled else Ending.ITERATION_LIMIT
         found = replace(found, solution=replace(found.solution, ending=ending), noise=smooth.noise)
     else:
-        learnt, found = smooth.first, at_odometry(drive, smooth.first, options)
+        learnt, found = before, at_odometry(drive, before, options)
     solution = found.solution
     if options.calibration is CalibrationUse.FIXED:
         solution = as_calibrated(solution, drive.sensors)
@@ -218,8 +218,10 @@ def at_odometry(drive: Drive, prior: WholePrior, options: SlamOptions) -> FieldS
         drive.steps, covariance=HELD**2 * drive.steps.covariance, scale=0.0, steady=None
     )
     sensors = with_noise(drive.sensors.loosened(whole.distortion, whole.offset), noise)
-    problem = stage_problem(replace(drive, steps=steps, sensors=sensors), prior, noise, options)
-    stage = solved_stage(problem, drive.dead_reckoning(), sensors, ROUNDS[-1])
+    held = replace(drive, steps=steps, sensors=sensors)
+    last = OFF_LINE[-1]
+    problem = stage_problem(held, prior, noise, options, last.iterations)
+    stage = solved_stage(problem, drive.dead_reckoning(), sensors, last.rounds)
     found = problem.finished(stage.last)
     graph, values = drive_graph(drive), drive_values(drive, drive.dead_reckoning())
     marginals = Marginals(graph.linearize(values), colamd_ordering(graph))

@@ -17,7 +17,7 @@ from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.unknown_field import end_state as module
 from l2m_gtsam.slam.unknown_field.end_state import end_state
 from l2m_gtsam.slam.unknown_field.path_information import PathNeighbourhood, path_information
-from l2m_gtsam.slam.unknown_field.smoothed_drive import SmoothedDrive, smoothed, with_noise
+from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, SmoothedDrive, smoothed, with_noise
 from l2m_gtsam.slam.unknown_field.whole_smoother import reported
 from l2m_gtsam.studies.slam.methods import as_recorded
 
@@ -45,7 +45,7 @@ def smooth() -> SmoothedDrive:
     )
     drive, _ = prepared(recording, as_recorded(0.3), options)
     drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
-    found = reported(smoothed(drive, drive.dead_reckoning(), options, (1, 1, 1)), silent)
+    found = reported(smoothed(drive, drive.dead_reckoning(), options, ON_LINE), silent)
     assert found is not None
     return found
 

@@ -15,6 +15,7 @@ from l2m_gtsam.slam.unknown_field.spectrum import (
 
 STRENGTH, LENGTH = 8.0, 1.0
 COUNT, PERIOD = 250, 0.4
+WAVES = 200
 
 
 def slow_noise(noise: SensorNoise, seconds: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -42,7 +43,7 @@ def read(noise: SensorNoise, C: FloatArray, seed: int) -> LearntReadings:
 def test_lasting_noise_is_told_from_white_noise_and_from_the_field() -> None:
     """Of some sixty independent values a standard deviation is known to a tenth; three times it."""
     true = SensorNoise(1.5, 0.1, 3.0)
-    found = learnt_spectrum(read(true, np.eye(3), 0), distortion=0.01, offset_ut=1.0)
+    found = learnt_spectrum(read(true, np.eye(3), 0), 0.01, 1.0, WAVES)
     assert found.noise.ut == pytest.approx(true.ut, rel=0.35)
     assert found.noise.white_ut == pytest.approx(true.white_ut, rel=0.5)
     assert true.slow_s / 2.5 < found.noise.slow_s < 2.5 * true.slow_s
@@ -53,7 +54,7 @@ def test_steel_beside_the_sensor_is_no_noise() -> None:
     """With C free the noise is found as without steel; with C held it would be many times that."""
     true, C = SensorNoise(0.3, 0.5, 3.0), np.diag([1.3, 0.8, 1.0])
     readings = read(true, C, 1)
-    free, held = (learnt_spectrum(readings, each, 1.0) for each in (0.3, 1e-3))
+    free, held = (learnt_spectrum(readings, each, 1.0, WAVES) for each in (0.3, 1e-3))
     assert free.noise.ut == pytest.approx(true.ut, rel=0.5)
     assert free.log_likelihood > held.log_likelihood + 50
     # The correction undoes it. A factor of all three axes is one of the field's strength, too; a
@@ -70,12 +71,15 @@ def test_scaling_all_readings_down_is_no_gain() -> None:
     unit = (level - level.mean(axis=0)).std()  # of the strengths below
     at = np.log([STRENGTH / unit, LENGTH, true.ut / unit, 1.0, true.slow_s])
     tight, wide = (
-        SpectrumLikelihood(readings, each, 1.0).log_likelihood(at) for each in (0.03, 3.0)
+        SpectrumLikelihood(readings, each, 1.0, WAVES).log_likelihood(at) for each in (0.03, 3.0)
     )
     assert wide < tight
 
 
 def test_a_second_search_begins_where_the_first_ended() -> None:
     readings = read(SensorNoise(1.0, 0.3, 2.0), np.eye(3), 3)
-    first = learnt_spectrum(readings, 0.1, 1.0)
-    assert learnt_spectrum(readings, 0.1, 1.0, first).log_likelihood >= first.log_likelihood - 1e-9
+    first = learnt_spectrum(readings, 0.1, 1.0, WAVES)
+    assert (
+        learnt_spectrum(readings, 0.1, 1.0, WAVES, first).log_likelihood
+        >= first.log_likelihood - 1e-9
+    )
