@@ -76,7 +76,8 @@ class WholeFieldOptions(Options):
     """The one field of a drive with a single sensor, where there is no map."""
 
     waves: int = Field(default=500, ge=50, le=2000)
-    """The most eigenfunctions. Where the field has more detail, it is described by tiles."""
+    """The most eigenfunctions. Where a coarse field needs more, it is described by tiles; the fine
+    one in which a drive is solved at last has so many of the longest."""
     offset: float = Field(default=10.0, gt=0)
     """Standard deviation per axis of what steel on the vehicle adds to the readings beyond the
     calibration, uT. It is estimated even where the calibration is fixed: the poses would have to

@@ -1,0 +1,60 @@
+"""How much of a field's detail one field for a whole drive holds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FieldSeries, Recording, SourceFile, Trajectory
+from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
+from l2m_gtsam.slam.drive import EXACT_START, Drive
+from l2m_gtsam.slam.localisation import prepared
+from l2m_gtsam.slam.options import SlamOptions, WholeFieldOptions
+from l2m_gtsam.slam.unknown_field.whole_field import fine_prior, learnt_prior, waves_for
+from l2m_gtsam.studies.slam.methods import as_recorded
+
+COUNT, EVERY_S = 300, 0.25
+NOISE_UT = 0.1
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    """Ten laps of a metre at different heights, in a field that changes over 30 cm."""
+    rng, at = np.random.default_rng(4), np.linspace(0, 20 * np.pi, COUNT)
+    p = np.column_stack([0.5 * np.cos(at), 0.4 * np.sin(0.97 * at), 0.2 * np.sin(0.31 * at)])
+    R = Rotation.from_euler("zx", np.column_stack([at, 0.3 * np.sin(at)])).as_matrix()
+    prior = PotentialHyperparameters(sigma=3.0, length=0.3)
+    basis = PotentialBasis.over(p.min(axis=0) - 0.5, p.max(axis=0) + 0.5, prior, 900)
+    b = basis.features(p) @ (np.sqrt(basis.variance) * rng.normal(size=len(basis)))
+    field = np.einsum("nji,nj->ni", R, b) + NOISE_UT * rng.normal(size=b.shape)
+    stamps = np.round(1e9 * EVERY_S * np.arange(COUNT)).astype(np.int64)
+    recording = Recording(
+        Trajectory(stamps, R, p, "map", "lidar"),
+        (FieldSeries("mag", "/mag", "lidar", stamps, field),),
+        SourceFile("laps", ""),
+    )
+    found, _ = prepared(recording, as_recorded(NOISE_UT), SlamOptions())
+    return replace(found, start=replace(found.start, covariance=EXACT_START))
+
+
+def test_a_field_with_detail_is_likelier_as_a_fine_one(drive: Drive) -> None:
+    """At true poses, beyond doubt: what a coarse field leaves out lasts for no time at all."""
+    options, poses = WholeFieldOptions(), drive.dead_reckoning()
+    coarse = learnt_prior(drive, poses, options)
+    assert coarse is not None
+    fine = fine_prior(drive, poses, options, coarse.spectrum)
+    assert fine.waves > coarse.waves
+    assert fine.spectrum.log_likelihood > coarse.spectrum.log_likelihood + 50
+
+
+def test_a_fine_field_has_as_many_waves_as_are_allowed(drive: Drive) -> None:
+    poses = drive.dead_reckoning()
+    assert fine_prior(drive, poses, WholeFieldOptions(waves=60)).waves == 60
+
+
+def test_waves_below_a_cut_are_counted() -> None:
+    """In a large box there are ``V k^3 / (6 pi^2)``, less what its faces take: a few per cent."""
+    size, cut = np.array([9.0, 8.0, 7.0]), 12.0
+    bulk = np.prod(size) * cut**3 / (6 * np.pi**2)
+    assert waves_for(size, cut) == pytest.approx(bulk, rel=0.1)
