@@ -38,7 +38,8 @@ def test_noiseless_pairs_give_the_truth(method: Method, seed: int) -> None:
     rng = np.random.default_rng(seed)
     fit = fit_distortion(b, z, rng.uniform(0.1, 5, 40), ClosedFormOptions(method=method))
     np.testing.assert_allclose(fit.distortion.C, truth.C, atol=2e-9)
-    np.testing.assert_allclose(fit.distortion.H, truth.H, atol=1e-7)
+    # Fields here reach 100 uT along their axes together, times the tolerance of C.
+    np.testing.assert_allclose(fit.distortion.H, truth.H, atol=2e-7)
 
 
 def test_ols_is_numpys_least_squares() -> None:
