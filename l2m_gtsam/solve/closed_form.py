@@ -138,7 +138,7 @@ class ClosedFormOptions(Options):
     """`fixed` (at `ridge_strength`), `gcv` or `l_curve`."""
     ridge_strength: float = Field(default=1e-9, ge=0)
     """Fixed ridge relative to the spread of the field. The default only stops directions that the
-    data leave open from running away; it moves C by a billionth."""
+    data leave open from running away; it moves C by some billionths."""
 
 
 @dataclass(frozen=True)

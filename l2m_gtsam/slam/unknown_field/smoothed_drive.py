@@ -48,7 +48,7 @@ class Stage:
     iterations
         The most of each round.
     learn
-        Learns the field before it, at the poses found so far.
+        Learns the field before it, at the poses found so far. Before the first the filter has.
     """
 
     noise_factor: float

@@ -100,11 +100,12 @@ def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> F
     """
     last, whole = smooth.stage.last, options.whole_field
     found = with_information(smooth.problem.finished(last), last.values, smooth.prior, smooth.noise)
+    odometry = drive.dead_reckoning()
     learnt = fine_prior(drive, last.poses, whole, smooth.prior.spectrum)
-    before = fine_prior(drive, drive.dead_reckoning(), whole, smooth.first.spectrum)
+    before = fine_prior(drive, odometry, whole, smooth.first.spectrum)
     likelier = learnt.spectrum.log_likelihood - before.spectrum.log_likelihood
     likelier -= found.solution.bent
-    gain = gain_of(found.solution.poses, drive.dead_reckoning(), found.marginals, likelier)
+    gain = gain_of(found.solution.poses, odometry, found.marginals, likelier)
     if gain.shown:
         settled = is_settled(smooth.stage, found.solution)
         ending = Ending.TOLERANCE if settled else Ending.ITERATION_LIMIT

@@ -39,7 +39,7 @@ def drive() -> Drive:
 
 
 def test_a_field_with_detail_is_likelier_as_a_fine_one(drive: Drive) -> None:
-    """At true poses, beyond doubt: what a coarse field leaves out lasts for no time at all."""
+    """At true poses, by more than 50 nats: what a coarse one leaves out is no noise."""
     options, poses = WholeFieldOptions(), drive.dead_reckoning()
     coarse = learnt_prior(drive, poses, options)
     assert coarse is not None
