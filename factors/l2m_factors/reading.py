@@ -5,6 +5,7 @@ readings, made when the first factor of a linearisation asks and kept until a va
 """
 
 import struct
+from typing import TypeAlias
 
 import gtsam
 import numpy as np
@@ -13,6 +14,8 @@ import numpy.typing as npt
 from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.keys import D, S, T
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
+
+Rows: TypeAlias = npt.NDArray[np.int64] | slice
 
 
 class BatchedReadings:
@@ -43,7 +46,7 @@ class BatchedReadings:
         self._timed = readings.motion is not None
         self._keys = {s: self._variables(s) for s in self._sensors}
         self._seen: dict[int, bytes] = {}
-        self._residuals = ReadingResiduals(*(np.empty(0),) * 4)
+        self._residuals: ReadingResiduals | None = None
         self._derived: tuple[ReadingResiduals, FloatArray] | None = None
 
     def __len__(self) -> int:
@@ -85,14 +88,37 @@ class BatchedReadings:
             These, if the caller knows them.
         """
         stamp = self.stamp(values, sensor) if stamp is None else stamp
-        if self._seen.get(sensor) != stamp:
-            self._evaluate(values)
+        if self._residuals is None or self._seen.get(sensor) != stamp:
+            self._residuals = self._evaluated(values)
         return self._residuals
 
     def jacobians(self, residuals: ReadingResiduals) -> list[FloatArray]:
         """Return the derivatives by each of ``keys_of``, each of shape (N, 3, .)."""
         by_D = [residuals.de_dD] if self._fixed is None else []
         return [residuals.de_dt, *by_D, *([residuals.de_dS] if self._timed else [])]
+
+    def white_jacobians(
+        self, residuals: ReadingResiduals, rows: Rows, W: FloatArray
+    ) -> list[FloatArray]:
+        """Return the derivatives of ``W e`` of some readings by each of ``keys_of``, (3 n, .).
+
+        Parameters
+        ----------
+        residuals
+            Of all readings.
+        rows
+            Which ones, n of them.
+        W
+            What makes their residuals white, in 1/uT, shape (n, 3, 3).
+        """
+        parts = [W @ residuals.de_dt[rows]]
+        if self._fixed is None:
+            # W (I kron b^T): nine products for each reading instead of a matrix full of zeros.
+            by_C = W[:, :, :, None] * residuals.b_lidar[rows, None, None]
+            parts.append(np.concatenate([by_C.reshape(-1, 3, 9), W], axis=2))
+        if self._timed:
+            parts.append(W @ residuals.de_dS[rows])
+        return [part.reshape(3 * len(W), -1) for part in parts]
 
     @property
     def widths(self) -> list[int]:
@@ -120,7 +146,7 @@ class BatchedReadings:
         distortion = [D(sensor)] if self._fixed is None else []
         return [T(sensor), *distortion, *([S(sensor)] if self._timed else [])]
 
-    def _evaluate(self, values: gtsam.Values) -> None:
+    def _evaluated(self, values: gtsam.Values) -> ReadingResiduals:
         # A sensor without values, as when one factor is used alone, is evaluated at zero; nobody
         # asks for it, because its stamp is not kept.
         count = self._sensors[-1] + 1
@@ -133,8 +159,8 @@ class BatchedReadings:
                 distortion[sensor] = values.atVector(D(sensor))
             if offset is not None:
                 offset[sensor] = values.atDouble(S(sensor))
-        self._residuals = reading_residuals(self._readings, self._map, t, distortion, offset)
         self._seen = {sensor: self.stamp(values, sensor) for sensor in present}
+        return reading_residuals(self._readings, self._map, t, distortion, offset)
 
 
 def reading_factor(
@@ -182,15 +208,15 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, sensor)
         if jacobians is not None:
-            for slot, jacobian in enumerate(batch.jacobians(residuals)):
-                jacobians[slot] = (W @ jacobian[rows]).reshape(3 * len(W), -1)
+            for slot, jacobian in enumerate(batch.white_jacobians(residuals, rows, W)):
+                jacobians[slot] = jacobian
         return np.asarray(np.einsum("nij,nj->ni", W, residuals.residual[rows]).ravel())
 
     unit = gtsam.noiseModel.Unit.Create(3 * len(W))
     return gtsam.CustomFactor(unit, batch.keys_of(sensor), error)
 
 
-def _span(rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64] | slice:
+def _span(rows: npt.NDArray[np.int64]) -> Rows:
     """Return rows that follow each other as a slice, which copies nothing."""
     if len(rows) and rows[-1] - rows[0] == len(rows) - 1:
         return slice(int(rows[0]), int(rows[-1]) + 1)

@@ -54,25 +54,51 @@ class MagneticReadings:
 
 @dataclass(frozen=True)
 class ReadingResiduals:
-    """Residuals of N readings and what their derivatives are made of.
+    """Residuals of N readings; their derivatives are computed when they are asked for.
 
     Attributes
     ----------
     residual
         ``e = C b + H - z`` in microtesla, shape (N, 3).
-    de_dt
-        Derivative by ``t_lidar_mag`` in microtesla per metre, shape (N, 3, 3).
     b_lidar
-        Field that the map predicts in the lidar frame in microtesla, shape (N, 3).
-    de_dS
-        Derivative by the time offset in microtesla per second, shape (N, 3, 1); zero without
-        motion.
+        Field b that the map predicts in the lidar frame in microtesla, shape (N, 3).
+    gradient
+        Derivative G of the map's field in microtesla per metre, shape (N, 3, 3).
+    R_map_lidar
+        Rotations from lidar to map, shape (N, 3, 3).
+    C
+        Of the sensor of each reading, shape (N, 3, 3).
+    t_lidar_mag
+        Its position in the lidar frame in metres, shape (N, 3).
+    motion
+        Of the lidar; none is rest.
     """
 
     residual: FloatArray
-    de_dt: FloatArray
     b_lidar: FloatArray
-    de_dS: FloatArray
+    gradient: FloatArray
+    R_map_lidar: FloatArray
+    C: FloatArray
+    t_lidar_mag: FloatArray
+    motion: PoseMotion | None = None
+
+    @cached_property
+    def slope(self) -> FloatArray:
+        """``R^T G R``: derivative of b by t in uT/m, shape (N, 3, 3)."""
+        return np.asarray(self.R_map_lidar.transpose(0, 2, 1) @ self.gradient @ self.R_map_lidar)
+
+    @cached_property
+    def de_dt(self) -> FloatArray:
+        """Derivative by ``t_lidar_mag`` in microtesla per metre, shape (N, 3, 3)."""
+        return np.asarray(self.C @ self.slope)
+
+    @cached_property
+    def de_dS(self) -> FloatArray:
+        """Derivative by the time offset in microtesla per second, (N, 3, 1); zero at rest."""
+        if self.motion is None or self.motion.at_rest:
+            return np.zeros((len(self.residual), 3, 1))
+        rate = field_rate(self.b_lidar, self.slope, self.t_lidar_mag, self.motion)
+        return np.asarray(self.C @ rate[:, :, None])
 
     @cached_property
     def de_dD(self) -> FloatArray:
@@ -113,13 +139,10 @@ def reading_residuals(
         R, p = moved(R, p, readings.motion, offset[sensor])
     t_lidar_mag = t[sensor]
     field, gradient = field_map.field_and_gradient(np.einsum("nij,nj->ni", R, t_lidar_mag) + p)
-    R_lidar_map = R.transpose(0, 2, 1)
-    b_lidar = np.einsum("nij,nj->ni", R_lidar_map, field)
+    b_lidar = np.einsum("nji,nj->ni", R, field)
     C = distortion[:, :9].reshape(-1, 3, 3)[sensor]
     residual = np.einsum("nij,nj->ni", C, b_lidar) + distortion[sensor, 9:] - readings.field
-    slope = R_lidar_map @ gradient @ R
-    rate = field_rate(b_lidar, slope, t_lidar_mag, motion)
-    return ReadingResiduals(residual, C @ slope, b_lidar, C @ rate[:, :, None])
+    return ReadingResiduals(residual, b_lidar, gradient, R, C, t_lidar_mag, motion)
 
 
 def field_rate(

@@ -47,7 +47,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
+from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.error_budget import EXPLAINED, Unmodelled
 from l2m_gtsam.solve.chi_square import quantile
 
@@ -166,17 +166,16 @@ class Scores:
     found: FloatArray
     expected: FloatArray
 
-    def ratio(self, covariance: FloatArray, block: slice) -> VarianceRatio:
+    def ratio(self, block: slice, white: FloatArray) -> VarianceRatio:
         """Return the variance found over that expected.
 
         Parameters
         ----------
-        covariance
-            P of the sensor's parameters, shape (16, 16).
         block
-            The parameters whose variances are taken together, each in its own sigmas.
+            The n parameters whose variances are taken together, each in its own sigmas.
+        white
+            From ``whitening_of`` their covariance, shape (n, n).
         """
-        white = whitening_of(covariance[block, block])
         scores = self.found[:, block] @ white.T
         found = float((scores**2).sum())
         parts = white @ self.expected[:, block, block] @ white.T
@@ -223,12 +222,14 @@ def scatters(
         Of all n variables.
     """
     P, found = covariance.among(own), []
+    white_by = {name: whitening_of(P[block, block]) for name, block in BLOCKS.items()}
+    white_whole = whitening_of(P[WHOLE, WHOLE])
     for labels in divisions(readings, rows):
-        white = gathered(rows, labels, own, covariance)
-        for merged in (white, white.paired()):
+        sums = gathered(rows, labels, own, covariance)
+        for merged in (sums, sums.paired()):
             scores = merged.scores(covariance)
-            ratios = {name: scores.ratio(P, block) for name, block in BLOCKS.items()}
-            found.append(Scatter(**ratios, whole=scores.ratio(P, WHOLE)))
+            ratios = {name: scores.ratio(block, white_by[name]) for name, block in BLOCKS.items()}
+            found.append(Scatter(**ratios, whole=scores.ratio(WHOLE, white_whole)))
     return tuple(found)
 
 
@@ -297,9 +298,9 @@ def halved(points: FloatArray, times: int) -> IntArray:
         one halving less.
     """
     part = np.zeros(len(points), dtype=np.int64)
-    for _ in range(times):
+    for level in range(times):
         later = np.zeros(len(points), dtype=np.bool_)
-        for label in np.unique(part):
+        for label in range(2**level):
             rows = np.flatnonzero(part == label)
             axis = int(np.ptp(points[rows], axis=0).argmax())
             order = rows[np.argsort(points[rows, axis], kind="stable")]
@@ -364,11 +365,14 @@ def gathered(
     found, brought = np.zeros((parts, SENSOR)), np.zeros((parts, SENSOR, SENSOR))
     crossed = np.zeros((parts, len(covariance), SENSOR))
     for each in rows:
-        Y, label = each.jacobian @ influence[each.columns], np.repeat(labels[each.readings], 3)
-        for part in np.unique(label):
-            taken: BoolArray = label == part
-            y = Y[taken]
-            found[part] += y.T @ each.residual[taken]
+        label = np.repeat(labels[each.readings], 3)
+        order = np.argsort(label, kind="stable")
+        J, e = each.jacobian[order], each.residual[order]
+        Y, first = J @ influence[each.columns], np.searchsorted(label[order], np.arange(parts + 1))
+        for part in np.flatnonzero(np.diff(first)):
+            own_rows = slice(first[part], first[part + 1])
+            y = Y[own_rows]
+            found[part] += y.T @ e[own_rows]
             brought[part] += y.T @ y
-            crossed[part, each.columns] += each.jacobian[taken].T @ y
+            crossed[part, each.columns] += J[own_rows].T @ y
     return Gathered(found, brought, crossed)

@@ -42,6 +42,8 @@ def determinacies(
         The scales of the test.
     """
     alone = {sensor: timed_determinacy(J, options) for sensor, J in jacobians.items()}
+    if not priors.each:
+        return alone
     held = frozenset(sensor for sensor, test in alone.items() if not test.offset)
     linear, tests = priors.graph(jacobians).linearize(values), dict(alone)
     for sensors in clusters_of(linear, list(jacobians)):

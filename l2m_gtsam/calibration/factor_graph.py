@@ -174,5 +174,6 @@ def whitened_jacobian(
     batch: BatchedReadings, W: FloatArray, values: gtsam.Values, sensor: int
 ) -> FloatArray:
     """Return derivatives of a sensor's white residuals by (t, C by row, H, offset), (3 n, 16)."""
-    jacobian, _ = block_factor(batch, sensor, W).linearize(values).jacobian()
-    return np.asarray(jacobian)
+    rows = batch.rows_of(sensor)
+    parts = batch.white_jacobians(batch.residuals(values, sensor), rows, W[rows])
+    return np.concatenate(parts, axis=1)

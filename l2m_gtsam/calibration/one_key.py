@@ -381,7 +381,7 @@ def settle(
             weights = now.weights
             return Joint(readings, estimate, whole, asked, weights, None, ending, settled=False)
         problem = joint_problem(now.view, field_map, estimate, options)
-        step = joint_step(problem, estimate, options, exact=now.final)
+        step = joint_step(problem, estimate, options, exact=now.agrees(last))
         moved = float(np.abs(step.estimate.t - estimate.t).max())
         late = float(np.abs(step.estimate.offset - estimate.offset).max())
         quiet = moved < SETTLED_M and late < SETTLED_S and step.estimate.same_noise(estimate)

@@ -46,6 +46,7 @@ class Ending(StrEnum):
     TOLERANCE = "the error no longer falls"
     ITERATION_LIMIT = "the iteration limit was reached"
     SINGULAR = "the linear system is singular"
+    UPHILL = "a step would have raised the error"
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Optimised:
     Attributes
     ----------
     values
-        Optimised values; the start if the system was singular.
+        Optimised values; the start if the system was singular, or a step went uphill.
     ending
         Why it stopped.
     """
@@ -110,8 +111,9 @@ def polish(
         if not refused(error):
             raise
         return Optimised(values, Ending.SINGULAR)
-    good = engine.error() <= worst  # which the engine knows: readings are not asked again
-    return Optimised(engine.values() if good else values, Ending.TOLERANCE)
+    if engine.error() > worst:  # which the engine knows: readings are not asked again
+        return Optimised(values, Ending.UPHILL)
+    return Optimised(engine.values(), Ending.TOLERANCE)
 
 
 def most_after_step(error: float) -> float:

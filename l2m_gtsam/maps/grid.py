@@ -1,6 +1,7 @@
 """Square blocks in x and y, columns in z, laid where there is data."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -37,6 +38,21 @@ class Grid:
         """Centres of the blocks in metres, shape (B, 2)."""
         return self.origin + (self.cells + 0.5) * self.size
 
+    @cached_property
+    def _corners(self) -> tuple[IntArray, IntArray]:
+        """The lowest and the highest cell in x and in y, each of shape (2,)."""
+        return self.cells.min(axis=0), self.cells.max(axis=0)
+
+    @cached_property
+    def _strides(self) -> IntArray:
+        lowest, highest = self._corners
+        return np.array([highest[1] - lowest[1] + 3, 1])
+
+    @cached_property
+    def _names(self) -> IntArray:
+        """A number for each block, in order, as the cells are, shape (B,)."""
+        return np.asarray((self.cells - self._corners[0]) @ self._strides)
+
     def block_of(self, points: FloatArray) -> IntArray:
         """Return the block that answers for each point: its own, else the nearest, shape (N,).
 
@@ -54,14 +70,12 @@ class Grid:
 
     def _own(self, points: FloatArray) -> IntArray:
         """Return the block in which each point lies, -1 if in none, shape (N,)."""
-        lowest, highest = self.cells.min(axis=0), self.cells.max(axis=0)
+        lowest, highest = self._corners
         # To the middle of one cell more on each side, which is for all that is outside.
         nearest, furthest = (lowest - 0.5) * self.size, (highest + 1.5) * self.size
         along = np.clip(points[:, :2] - self.origin, nearest, furthest)
         cells = np.floor(along / self.size).astype(np.int64) - lowest
-        width = highest[1] - lowest[1] + 3
-        names = (self.cells - lowest) @ (width, 1)  # in order, as the cells are
-        wanted = cells @ (width, 1)
+        names, wanted = self._names, cells @ self._strides
         found = np.minimum(np.searchsorted(names, wanted), len(names) - 1)
         return np.asarray(np.where(names[found] == wanted, found, -1))
 

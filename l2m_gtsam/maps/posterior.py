@@ -1,17 +1,15 @@
 """A Gaussian process: its kernel, and what it predicts near one block for batches of points."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky
-from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dtrtri
 
-from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.hyperparameters import KernelHyperparameters, not_definite
 from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.maps.whitener import Whitener
 
 FURTHEST = 1e6
 """Points are pulled to this distance, in length scales, where every kernel is zero anyway."""
@@ -45,32 +43,10 @@ def kernel_matrix(x: FloatArray, y: FloatArray, signal: float) -> FloatArray:
     signal
         Prior standard deviation s in uT.
     """
-    return kernel_to(x, training_columns(y, signal))
-
-
-def training_columns(y: FloatArray, signal: float) -> FloatArray:
-    """Return the features of training points in the exponent, shape (5, M); see ``kernel_matrix``.
-
-    They stay the same for all points that are evaluated.
-    """
-    # s^2 as a summand of the exponent saves one pass over the matrix.
+    # s^2 and the squares as summands of the exponent save passes over the matrix.
     offset = 2 * np.log(signal) - 0.5 * np.einsum("mi,mi->m", y, y)
-    return np.ascontiguousarray(np.column_stack([y, np.ones(len(y)), offset]).T)
-
-
-def kernel_to(x: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return the kernel between scaled points, shape (N, 3), and training points, shape (N, M).
-
-    Parameters
-    ----------
-    x
-        Scaled points, shape (N, 3).
-    columns
-        From ``training_columns``, shape (5, M).
-    """
-    rows = np.empty((len(x), 5))
-    rows[:, :3], rows[:, 3], rows[:, 4] = x, -0.5 * np.einsum("ni,ni->n", x, x), 1.0
-    K = rows @ columns
+    rows = np.column_stack([x, -0.5 * np.einsum("ni,ni->n", x, x), np.ones(len(x))])
+    K = rows @ np.column_stack([y, np.ones(len(y)), offset]).T
     np.exp(K, out=K)
     return np.asarray(K)
 
@@ -92,9 +68,9 @@ class Posterior:
     noise_variance
         Of each reading in square microtesla, shape (M,).
     whitener
-        Inverse of the lower Cholesky factor of the readings' covariance in 1/uT, shape (M, M), or
-        None where memory is short: then it is computed again for each batch that asks for
-        variances. A product with it takes a third of the time of a solve with the factor.
+        Of the readings' covariance, or None where memory is short: then it is computed again for
+        each batch that asks for variances. A product with it takes a third of the time of a solve
+        with the factor.
     """
 
     hyperparameters: KernelHyperparameters
@@ -102,34 +78,28 @@ class Posterior:
     y: FloatArray
     alpha: FloatArray
     noise_variance: FloatArray
-    whitener: FloatArray | None
+    whitener: Whitener | None
 
-    @cached_property
-    def columns(self) -> FloatArray:
-        """Of ``training_columns``, shape (5, M)."""
-        return training_columns(self.y, self.hyperparameters.signal)
+    def variance(self, points: FloatArray, room: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the posterior variance of each axis, and how far the nearest reading is.
 
-    def rows(self, points: FloatArray) -> FloatArray:
-        """Return the kernel between points in metres, (N, 3), and readings in uT^2, (N, M)."""
-        return kernel_to(
-            scaled(points, self.centre, self.hyperparameters.length_scale), self.columns
-        )
+        Parameters
+        ----------
+        points
+            Metres, shape (N, 3).
+        room
+            To be written over, at least of shape (N M,).
 
-    def variance(self, K: FloatArray) -> FloatArray:
-        """Return the posterior variance of each axis in square microtesla, from rows, (N,)."""
-        whitener = self.whitener
+        Returns
+        -------
+        tuple
+            Square microtesla, shape (N,), and squares of length scales, shape (N,).
+        """
+        known, whitener = self.hyperparameters, self.whitener
         if whitener is None:
-            whitener = inverted(factorise(self.y, self.noise_variance, self.hyperparameters))
-        # k(x, x) - k^T K^-1 k (Rasmussen and Williams 2006, equation 2.26) as a sum of squares.
-        V = dtrmm(1.0, whitener, K.T, lower=1)
-        explained = np.einsum("mn,mn->n", V, V)
-        return np.asarray(np.maximum(self.hyperparameters.signal**2 - explained, 0.0))
-
-    def within(self, K: FloatArray, reach: float) -> BoolArray:
-        """Return whether the nearest reading lies within ``reach`` length scales, shape (N,)."""
-        # The kernel falls with distance: its largest value belongs to the nearest reading.
-        least = self.hyperparameters.signal**2 * np.exp(-0.5 * reach**2)
-        return np.asarray(K.max(axis=1) >= least)
+            whitener = Whitener.of(factorise(self.y, self.noise_variance, known))
+        x = scaled(points, self.centre, known.length_scale)
+        return whitener.variance(x, self.y, known.signal, room)
 
     def without_whitener(self) -> "Posterior":
         """Return the same posterior in less memory."""
@@ -162,7 +132,7 @@ def condition(
     noise_variance = hyperparameters.noise**2 / readings.weight
     factor = factorise(y, noise_variance, hyperparameters)
     alpha = cho_solve((factor, True), readings.field - mean, check_finite=False)
-    return Posterior(hyperparameters, centre, y, alpha, noise_variance, inverted(factor))
+    return Posterior(hyperparameters, centre, y, alpha, noise_variance, Whitener.of(factor))
 
 
 def factorise(
@@ -176,9 +146,3 @@ def factorise(
         return np.asarray(cholesky(K.T, lower=True, overwrite_a=True, check_finite=False))
     except LinAlgError:
         raise MapError(not_definite(hyperparameters)) from None
-
-
-def inverted(factor: FloatArray) -> FloatArray:
-    """Return the inverse of a lower triangular matrix, which it replaces, shape (M, M)."""
-    inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)
-    return np.asarray(inverse)

@@ -6,9 +6,10 @@ and in a margin around it. All blocks share hyperparameters and prior mean, so t
 to the dense process as the margin grows.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 from typing import Any, Self
 
 import numpy as np
@@ -22,10 +23,12 @@ from l2m_gtsam.maps.kernel_sum import KernelSums
 from l2m_gtsam.maps.posterior import Posterior, condition
 from l2m_gtsam.maps.trained import GPMap, GPOptions, Trained
 from l2m_gtsam.maps.training import checked_points
+from l2m_gtsam.parallel.threads import in_threads
 
-MOST_IN_BLOCK = 6000  # rows; the whitener of such a block takes 290 MB
+MOST_IN_BLOCK = 6000  # rows; the factor of such a block takes 290 MB
 FACTOR_MEMORY = 1e9  # bytes of whiteners that are kept for variances
 BATCH = 256  # points whose kernel rows are in memory, and about in cache, at once
+PIECES = 8  # of a query, for threads: one for each visit of a block would cost more than it gains
 
 
 class SlidingGPOptions(GPOptions):
@@ -119,13 +122,8 @@ class SlidingGP(GPMap[SlidingGPOptions]):
         """Return field, gradient and variance; see ``FieldMap``."""
         points = checked_points(points)
         field, gradient = self.field_and_gradient(points)
-        variance, inside = np.empty((len(points), 3)), np.empty(len(points), dtype=np.bool_)
-        for visit in self._visits(points):
-            block, at = self.blocks[visit.block], visit.rows
-            K = block.rows(points[at])
-            variance[at] = block.variance(K)[:, None]
-            inside[at] = block.within(K, self.options.reach)
-        return masked(FieldSample(field, gradient, variance, inside))
+        variance, nearest = self._variance(points)
+        return masked(FieldSample(field, gradient, variance, nearest <= self.options.reach**2))
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""
@@ -135,12 +133,24 @@ class SlidingGP(GPMap[SlidingGPOptions]):
 
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis, also outside; see ``FieldMap``."""
-        points = checked_points(points)
-        variance = np.empty((len(points), 3))
-        for visit in self._visits(points):
-            block, at = self.blocks[visit.block], visit.rows
-            variance[at] = block.variance(block.rows(points[at]))[:, None]
-        return variance
+        return self._variance(checked_points(points))[0]
+
+    def _variance(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return variances (N, 3) and squares of distances to readings in length scales (N,)."""
+        variance, nearest = np.empty(len(points)), np.empty(len(points))
+
+        def ask(visits: Iterable[BlockQuery]) -> None:
+            room = np.empty(BATCH * max(len(block.y) for block in self.blocks))
+            for visit in visits:
+                at = visit.rows
+                variance[at], nearest[at] = self.blocks[visit.block].variance(points[at], room)
+
+        visits = list(self._visits(points))
+        kept = [self.blocks[visit.block].whitener is not None for visit in visits]
+        quick = list(compress(visits, kept))
+        in_threads(ask, (quick[piece::PIECES] for piece in range(PIECES)))
+        ask(compress(visits, np.logical_not(kept)))  # one whitener at a time in memory
+        return np.tile(variance[:, None], 3), nearest
 
     def _visits(self, points: FloatArray) -> Iterator[BlockQuery]:
         """Yield every point once, block by block and batch by batch."""
@@ -169,5 +179,5 @@ def posteriors(trained: Trained, members: list[IntArray]) -> Iterator[Posterior]
     mean, used = trained.readings.mean, 0
     for rows in members:
         posterior = condition(trained.readings[rows], mean, trained.hyperparameters)
-        used += 8 * len(rows) ** 2
+        used += 8 * len(posterior.whitener.entries) if posterior.whitener else 0
         yield posterior if used <= FACTOR_MEMORY else posterior.without_whitener()

@@ -25,8 +25,27 @@ def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatAr
     map_variance
         Variance of the map per axis of the map frame in uT^2, shape (N, 3).
     """
-    A = C @ R_map_lidar.transpose(0, 2, 1)
-    return np.asarray((A * map_variance[:, None, :]) @ A.transpose(0, 2, 1))
+    share = np.empty(C.shape)
+    given = (np.ascontiguousarray(each) for each in (C, R_map_lidar, map_variance))
+    write_map_shares(*given, share)
+    return share
+
+
+@njit(cache=True, nogil=True)
+def write_map_shares(C: FloatArray, R: FloatArray, variance: FloatArray, share: FloatArray) -> None:
+    """Write what ``map_covariance`` returns: products of small matrices, one after the other."""
+    A = np.empty((3, 3))
+    for n in range(len(share)):
+        for i in range(3):
+            for k in range(3):
+                A[i, k] = (
+                    C[n, i, 0] * R[n, k, 0] + C[n, i, 1] * R[n, k, 1] + C[n, i, 2] * R[n, k, 2]
+                )
+        v0, v1, v2 = variance[n, 0], variance[n, 1], variance[n, 2]
+        for i in range(3):
+            for j in range(i + 1):
+                both = A[i, 0] * v0 * A[j, 0] + A[i, 1] * v1 * A[j, 1] + A[i, 2] * v2 * A[j, 2]
+                share[n, i, j] = share[n, j, i] = both
 
 
 def reading_covariance(

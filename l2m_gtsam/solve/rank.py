@@ -8,6 +8,7 @@ from scipy.linalg import qr, solve_triangular
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.options import Options
+from l2m_gtsam.solve.linear_algebra import triangular_rows
 
 PARAMETERS = (
     *("t_x", "t_y", "t_z"),
@@ -96,11 +97,11 @@ def timed_determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy
     options
         Largest useful sigmas of t (m), C, H (uT) and the offset (s).
     """
-    jacobian = np.asarray(np.linalg.qr(jacobian, mode="r"))  # same J^T J in 16 rows
+    jacobian = triangular_rows(jacobian)  # same J^T J in 16 rows
     scaled = jacobian * np.append(options.scale(), options.useful_offset_s)
     # A step of one of the 15 counts as one standard deviation of what is known without readings.
     others = np.vstack([scaled, np.eye(15, 16)])
-    triangular = np.asarray(np.linalg.qr(others, mode="r"))
+    triangular = triangular_rows(others)
     # The last diagonal entry of R is the length of the offset's column beside all others, hence one
     # over its sigma (in useful ones) with the others marginalised.
     if abs(triangular[-1, -1]) < 1.0:
@@ -129,7 +130,7 @@ def determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:
     """
     # In units of useful sigmas a singular value below one is a direction with a sigma above the
     # useful one; QR instead of J^T J, which would square the condition number.
-    triangular = np.asarray(np.linalg.qr(jacobian * options.scale(), mode="r"))
+    triangular = triangular_rows(jacobian * options.scale())
     square = np.zeros((15, 15))
     square[: len(triangular)] = triangular
     _, s, Vt = np.linalg.svd(square)

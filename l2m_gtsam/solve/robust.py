@@ -18,7 +18,6 @@ from enum import StrEnum
 import numpy as np
 from pydantic import Field
 from scipy.ndimage import label, uniform_filter1d
-from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
@@ -124,17 +123,11 @@ def median_noise(residual: FloatArray, map_variance: FloatArray) -> float:
         Mean variance of the map's prediction in uT^2, shape (N,).
     """
     # A median holds while fewer than half of the readings are wrong; a mean of squares does not.
+    # Half of all r^2 = e^2 / (sigma^2 + v) are below a median m where half of all e^2 / m - v are
+    # below sigma^2.
     e2 = np.einsum("ni,ni->n", residual, residual)
-
-    def excess(log_sigma: float) -> float:
-        return float(np.median(e2 / (np.exp(2 * log_sigma) + map_variance))) - MEDIAN
-
-    low, high = np.log(NOISE_RANGE)
-    if excess(low) <= 0:
-        return NOISE_RANGE[0]
-    if excess(high) >= 0:
-        return NOISE_RANGE[1]
-    return float(np.exp(brentq(excess, low, high, xtol=1e-4)))
+    variance = float(np.median(e2 / MEDIAN - map_variance))
+    return float(np.sqrt(np.clip(variance, *np.square(NOISE_RANGE))))
 
 
 def consistent(
