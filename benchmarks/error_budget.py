@@ -18,7 +18,7 @@ from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.one_key import settle, solve_one_key
 from l2m_gtsam.calibration.uncertain import settle_by_any, solve_uncertain
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive
-from l2m_gtsam.calibration.view import RememberedMap
+from l2m_gtsam.calibration.view import RememberedMap, StandIns
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -73,7 +73,8 @@ def cost(field_map: CompiledMap, readings: Readings) -> Cost:
         noise=np.full(SENSORS, NOISE),
     )
     asked = RememberedMap(field_map)
-    joint = settle(readings, asked, Alternated(start, start.t, steps=0), OPTIONS, silent, None)
+    near, few = Alternated(start, start.t, steps=0), StandIns.of(readings, OPTIONS.fewer_readings)
+    joint = settle(readings, few, asked, near, OPTIONS, silent, None)
     if joint.problem is None:
         raise RuntimeError("no sensor has enough readings")
     view = joint.problem.view

@@ -353,6 +353,12 @@ class FieldSample:
     variance: FloatArray
     inside: BoolArray
 
+    def select(self, keep: BoolArray) -> "FieldSample":
+        """Return what it says at some of the points, shape (N,)."""
+        return FieldSample(
+            self.field[keep], self.gradient[keep], self.variance[keep], self.inside[keep]
+        )
+
 
 @dataclass(frozen=True)
 class LidarMap:

@@ -10,7 +10,7 @@ from l2m_factors import T
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, reading_graph
 from l2m_gtsam.calibration.optimise import Optimizer, optimise
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.view import QueryableMap, View, observe, seen_from
+from l2m_gtsam.calibration.view import QueryableMap, StandIns, View, glimpse, seen_from
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.options import Options
 from l2m_gtsam.progress import Progress
@@ -26,6 +26,7 @@ DISTORTION = 12  # parameters of C and H
 FEWEST = 5
 # The map's errors change over decimetres: to come near, variances from so near by do, metres.
 NEAR_M = 0.03
+STANDS_FOR = 4  # readings of the alternation have the variance of the nearest of them
 # Weak tie of each T(i) to where it is, for directions without any gradient: metres.
 TIE_M = 10.0
 
@@ -77,6 +78,11 @@ class OneKeyOptions(Options):
         """Readings of each sensor that are enough to come near."""
         return max(self.alternation_readings, self.min_readings)
 
+    @property
+    def fewer_readings(self) -> int:
+        """Readings of each sensor where the map's variance is asked for to come near."""
+        return max(self.alternation_readings // STANDS_FOR, self.min_readings)
+
 
 @dataclass(frozen=True)
 class Alternated:
@@ -112,6 +118,7 @@ def start_estimate(
 
 def alternate(
     readings: Readings,
+    stand_ins: StandIns,
     field_map: QueryableMap,
     start: Estimate,
     options: OneKeyOptions,
@@ -119,11 +126,11 @@ def alternate(
 ) -> Alternated:
     """Alternate closed form and translation graph until no sensor moves further than settled.
 
-    It only has to come near: `alternation_readings` of each sensor are enough, with variances of
-    the map that are asked for anew only where sensors have moved.
+    It only has to come near: `alternation_readings` of each sensor are enough, with the map's
+    variance at fewer yet, which is asked for anew only where sensors have moved.
     """
     estimate, furthest, last = start, options.settled_m, 0.0
-    view, asked, step = observe(readings, field_map, start, FEWEST), start.t, 0
+    view, asked, step = glimpse(readings, stand_ins, field_map, start, start.t, FEWEST), start.t, 0
     while view.sensors and step < options.max_steps:
         step += 1
         moved = move_sensors(view, field_map, fit_distortions(view, estimate, options), options)
@@ -136,7 +143,8 @@ def alternate(
         if np.abs(estimate.t - asked).max() <= NEAR_M:
             view = seen_from(view, field_map, estimate)
         else:
-            view, asked = observe(readings, field_map, estimate, FEWEST), estimate.t
+            asked = estimate.t
+            view = glimpse(readings, stand_ins, field_map, estimate, asked, FEWEST)
     return Alternated(estimate, asked, step)
 
 

@@ -221,10 +221,12 @@ def scatters(
     covariance
         Of all n variables.
     """
-    P, found = covariance.among(own), []
+    parts, P, found = tuple(divisions(readings, rows)), covariance.among(own), []
+    if not parts:
+        return ()
     white_by = {name: whitening_of(P[block, block]) for name, block in BLOCKS.items()}
     white_whole = whitening_of(P[WHOLE, WHOLE])
-    for labels in divisions(readings, rows):
+    for labels in parts:
         sums = gathered(rows, labels, own, covariance)
         for merged in (sums, sums.paired()):
             scores = merged.scores(covariance)

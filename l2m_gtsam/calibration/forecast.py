@@ -16,7 +16,7 @@ from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
-from l2m_gtsam.calibration.view import QueryableMap, View, glimpse, observe
+from l2m_gtsam.calibration.view import QueryableMap, StandIns, View, glimpse, observe
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.solve.rank import Determinacy
@@ -116,9 +116,9 @@ def rank_tests(
         Standard deviation of each sensor's noise in uT, shape (S,).
     """
     start = replace(start_estimate(t_lidar_mag, options, priors), noise=noise)
-    few, least = options.some_readings, options.min_readings
-    # Where the solve has asked for it: a few readings' variance tells what is determined.
-    view = glimpse(readings, field_map, start, t_lidar_mag, least, few)
+    # A few readings' variance tells what is determined; the solve has asked for it.
+    few, least = StandIns.of(readings, options.fewer_readings), options.min_readings
+    view = glimpse(readings, few, field_map, start, t_lidar_mag, least)
     ideal = ideal_sensors(start, view, options)
     if not ideal.view.sensors:
         return {}

@@ -49,6 +49,7 @@ from l2m_gtsam.calibration.view import (
     REOBSERVE_M,
     QueryableMap,
     RememberedMap,
+    StandIns,
     View,
     glimpse,
     observe,
@@ -248,11 +249,13 @@ def _solved(
     finish: Finish,
 ) -> OneKeySolution:
     field_map = remembered(field_map)
-    some = readings.select(spread(readings, options.some_readings))
-    some = some.select(plausible(some, field_map, t_start, options.robust))
-    start = start_estimate(t_start, options, priors)
-    near = alternate(some, field_map, start, options, progress)
-    joint = settle(readings, field_map, near, options, progress, trajectory)
+    stand_ins = StandIns.of(readings, options.fewer_readings)
+    some = spread(readings, options.some_readings)
+    sample = stand_ins.select(some).sample(readings.select(some), field_map, t_start, t_start)
+    some[some] = plausible(readings.select(some), sample, options.robust)
+    start, of_some = start_estimate(t_start, options, priors), stand_ins.select(some)
+    near = alternate(readings.select(some), of_some, field_map, start, options, progress)
+    joint = settle(readings, stand_ins, field_map, near, options, progress, trajectory)
     outcome = OneKeySolution(
         readings=joint.readings,
         estimate=joint.estimate,
@@ -357,6 +360,7 @@ class Joint:
 
 def settle(
     readings: Readings,
+    stand_ins: StandIns,
     field_map: QueryableMap,
     near: Alternated,
     options: OneKeyOptions,
@@ -367,9 +371,9 @@ def settle(
 
     That is the graduated loop too: each round trusts readings as the residuals of the last say.
     """
-    estimate, few = near.estimate, options.some_readings
     # The first round moves all sensors: a few readings' variance is enough for it.
-    whole = glimpse(readings, field_map, estimate, near.asked, options.min_readings, few)
+    estimate, least = near.estimate, options.min_readings
+    whole = glimpse(readings, stand_ins, field_map, estimate, near.asked, least)
     asked = np.full((len(whole.readings), 3), np.inf)
     ending, settled = Ending.TOLERANCE, False
     last: Trusted | None = None

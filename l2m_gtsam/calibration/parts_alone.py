@@ -190,7 +190,8 @@ def by_parts(
                 block = BLOCKS[name]
                 followed, spread = walk.followed[own[block]], walk.spread if name == "H" else 0.0
                 share = share_shown(P[block, block], seen[:, block], followed, spread)
-                ratios.append(lasting(scores.ratio(P, block), share))
+                ratio = scores.ratio(block, whitening_of(P[block, block]))
+                ratios.append(lasting(ratio, share))
     return ByParts(
         sensor, vector, P[: SENSOR - 1, : SENSOR - 1], {k: tuple(v) for k, v in found.items()}
     )

@@ -10,8 +10,8 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
-from l2m_gtsam.calibration.view import QueryableMap, View, places_of
-from l2m_gtsam.data import BoolArray, FloatArray, Readings
+from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 from l2m_gtsam.solve.robust import (
     WEIGHTS,
@@ -57,9 +57,7 @@ class Trusted:
         return self.final and other.final and same
 
 
-def plausible(
-    readings: Readings, field_map: QueryableMap, t: FloatArray, options: RobustOptions
-) -> BoolArray:
+def plausible(readings: Readings, sample: FieldSample, options: RobustOptions) -> BoolArray:
     """Return which readings one distortion per sensor explains at given places, shape (N,).
 
     The places need not be right: what half of the readings leave there is taken for noise.
@@ -67,18 +65,16 @@ def plausible(
     Parameters
     ----------
     readings
-        Of S sensors.
-    field_map
-        The map.
-    t
-        Places in the lidar frame in metres, shape (S, 3).
+        Of several sensors.
+    sample
+        What the map says there.
     options
         Of the loss; a squared one takes all readings for plausible.
     """
     keep = np.ones(len(readings), dtype=np.bool_)
     if options.loss is Loss.SQUARED:
         return keep
-    R, sample = readings.R_map_lidar, field_map.query(places_of(readings, t))
+    R = readings.R_map_lidar
     for sensor in range(len(readings.sensors)):
         own = np.arange(len(readings))[readings.rows_of(sensor)]
         own = own[sample.inside[own]]

@@ -100,37 +100,66 @@ def observe(
     return _view(readings, sample, len(estimate.t), min_readings)
 
 
+@dataclass(frozen=True)
+class StandIns:
+    """A few readings at whose places the map's variance is asked for instead of at all N.
+
+    Attributes
+    ----------
+    few
+        Those readings.
+    nearest
+        Which of them is the nearest to each of the N along its sensor's own, shape (N,).
+    """
+
+    few: Readings
+    nearest: IntArray
+
+    @classmethod
+    def of(cls, readings: Readings, most: int) -> "StandIns":
+        """Take at most so many readings of each sensor."""
+        few, every = np.flatnonzero(spread(readings, most)), np.arange(len(readings))
+        # The first and the last reading of each sensor are among them: both neighbours are its own.
+        after = np.searchsorted(few, every)
+        before = np.maximum(after - 1, 0)
+        return cls(readings[few], np.where(every - few[before] < few[after] - every, before, after))
+
+    def select(self, keep: BoolArray) -> "StandIns":
+        """Return those of some of the readings, shape (N,)."""
+        return StandIns(self.few, self.nearest[keep])
+
+    def sample(
+        self, readings: Readings, field_map: QueryableMap, t: FloatArray, t_few: FloatArray
+    ) -> FieldSample:
+        """Return what the map says of the readings.
+
+        Parameters
+        ----------
+        readings
+            N, of S sensors.
+        field_map
+            The map.
+        t
+            Where the field is taken, metres, shape (S, 3).
+        t_few
+            Where the variance is: there, near by, or where the map was asked before.
+        """
+        known = field_map.query(places_of(self.few, t_few))
+        field, gradient = field_map.field_and_gradient(places_of(readings, t))
+        at = self.nearest
+        return FieldSample(field, gradient, known.variance[at], known.inside[at])
+
+
 def glimpse(
     readings: Readings,
+    stand_ins: StandIns,
     field_map: QueryableMap,
     estimate: Estimate,
-    t: FloatArray,
+    t_few: FloatArray,
     min_readings: int,
-    most: int,
 ) -> View:
-    """Return a view whose variance is that of a few readings: each has that of the nearest.
-
-    Parameters
-    ----------
-    readings, field_map
-        Of S sensors, and the map.
-    estimate
-        Where the field is taken.
-    t
-        Where the variance is: near by, or where the map was asked before, metres, shape (S, 3).
-    min_readings
-        That a sensor needs.
-    most
-        Readings of a sensor whose variance is asked for.
-    """
-    few, every = np.flatnonzero(spread(readings, most)), np.arange(len(readings))
-    # The first and the last reading of each sensor are among them: both neighbours are its own.
-    after = np.searchsorted(few, every)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(every - few[before] < few[after] - every, before, after)
-    known = field_map.query(places_of(readings[few], t))
-    field, gradient = field_map.field_and_gradient(places_of(readings, estimate.t))
-    sample = FieldSample(field, gradient, known.variance[nearest], known.inside[nearest])
+    """Return a view whose variance is that of a few readings, and the field its own."""
+    sample = stand_ins.sample(readings, field_map, estimate.t, t_few)
     return _view(readings, sample, len(estimate.t), min_readings)
 
 

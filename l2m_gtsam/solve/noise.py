@@ -26,8 +26,8 @@ def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatAr
         Variance of the map per axis of the map frame in uT^2, shape (N, 3).
     """
     share = np.empty(C.shape)
-    given = (np.ascontiguousarray(each) for each in (C, R_map_lidar, map_variance))
-    write_map_shares(*given, share)
+    C, R, variance = (np.ascontiguousarray(each) for each in (C, R_map_lidar, map_variance))
+    write_map_shares(C, R, variance, share)
     return share
 
 

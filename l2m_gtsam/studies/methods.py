@@ -11,7 +11,7 @@ from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings, reading_graph
 from l2m_gtsam.calibration.forecast import stated_at
 from l2m_gtsam.calibration.optimise import Optimizer, optimise
-from l2m_gtsam.calibration.view import QueryableMap, observe
+from l2m_gtsam.calibration.view import QueryableMap, StandIns, observe
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.progress import silent
@@ -45,7 +45,8 @@ def two_step(
     """
     options = OneKeyOptions(closed_form=closed_form, alternation_readings=len(readings))
     start = start_estimate(t_start[None], options)
-    return alternate(readings, field_map, start, options, silent).estimate
+    every = StandIns.of(readings, len(readings))
+    return alternate(readings, every, field_map, start, options, silent).estimate
 
 
 def published(

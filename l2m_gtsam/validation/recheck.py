@@ -195,12 +195,11 @@ def usable(
 ) -> BoolArray:
     """Return the readings inside the map that one distortion explains beside the others, (N,)."""
     readings = drive.at(float(known.vector[15]))
-    t = known.vector[None, :3]
-    sample = field_map.query(readings.R_map_lidar @ t[0] + readings.p_map_lidar)
+    sample = field_map.query(readings.R_map_lidar @ known.vector[:3] + readings.p_map_lidar)
     within = sample.inside.copy()
     rows = np.flatnonzero(within)
     own = readings[rows]
-    wrong = ~plausible(own, field_map, t, options.robust)
+    wrong = ~plausible(own, sample.select(within), options.robust)
     if wrong.any():
         variance = sample.variance[rows].mean(axis=1)
         e = residuals(own, field_map, known.estimate())
