@@ -22,7 +22,7 @@ from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress, silent
-from l2m_gtsam.qa.evaluate import evaluate
+from l2m_gtsam.qa.evaluate import measured
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.calibration import judgement_of
 from l2m_gtsam.records.calibration import CalibrationResult
@@ -191,10 +191,10 @@ def calibrate(
     chosen = options_of(CalibrationOptions, options, "calibration")
     limits = options_of(QaOptions, qa, "qa")
     found = calibrated(recording, field_map, chosen, None, progress)
-    metrics = evaluate(recording, found, chosen, limits, progress)
+    measures = measured(recording, found, chosen, limits, progress)
     config = Config(calibration=chosen, qa=limits)
     unjudged = replace(found.result, options=config.model_dump(mode="json"))
-    judgement = judgement_of(unjudged, metrics, limits)
+    judgement = judgement_of(unjudged, measures, limits)
     return JudgedCalibration(replace(unjudged, judgement=judgement), judgement.verdict)
 
 

@@ -16,8 +16,6 @@ from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary, Remembering
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.qa.report.figures.map import map_figure
-from l2m_gtsam.qa.report.svg import save_figure
 from l2m_gtsam.records.map_diary import MapDiary
 from l2m_gtsam.storage.map_file import save_map
 from l2m_gtsam.upkeep.dated_changes import drive_dates
@@ -275,6 +273,10 @@ def describe_map_file(path: Path, progress: Progress) -> MapDescription:
 
 def plot_map_file(path: Path, out: Path, height: float | None, progress: Progress) -> None:
     """Draw a map at a height in metres (the middle of its readings if None) as a picture."""
+    # Pictures need matplotlib, which takes a third of a second to import.
+    from l2m_gtsam.qa.report.figures.map import map_figure
+    from l2m_gtsam.qa.report.svg import save_figure
+
     check_outputs(out, suffix=".png")
     field_map = SavedMap.read(path).open(progress)
     ensure_folder(out.parent)

@@ -18,7 +18,7 @@ from l2m_gtsam.data import FloatArray, Readings, Recording
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.parallel.threads import in_threads, one_blas_thread
 from l2m_gtsam.progress import Progress, silent
-from l2m_gtsam.qa.metrics.assemble import MapForms, Repeats, SeenSensors, map_picture, metrics_of
+from l2m_gtsam.qa.metrics.assemble import Repeats, SeenSensors, map_picture, measures_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
 from l2m_gtsam.qa.metrics.repeatability import (
     PartialEstimate,
@@ -28,7 +28,7 @@ from l2m_gtsam.qa.metrics.repeatability import (
     no_halves,
 )
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.records.metrics import Halves, Metrics, Repeatability
+from l2m_gtsam.records.metrics import Halves, Measures, Metrics, Repeatability
 
 FIGURES = "figures"
 """Stage of the figures of a calibration and its picture."""
@@ -37,14 +37,14 @@ MORE = 4  # times as many readings of a drive as of a half
 
 
 @one_blas_thread()
-def evaluate(
+def measured(
     recording: Recording,
     calibrated: Calibrated,
     options: CalibrationOptions,
     qa: QaOptions,
     progress: Progress = silent,
-) -> Metrics:
-    """Return the metrics of a calibration.
+) -> Measures:
+    """Return the figures that a verdict rests on.
 
     Parameters
     ----------
@@ -59,14 +59,30 @@ def evaluate(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    evidence, maps = evidence_of(calibrated), maps_of(calibrated)
-    seen = SeenSensors.of(calibrated.result, evidence, maps.along_drive)
     repeats = repeats_of(recording, calibrated, options, qa, progress)
+    return measures_of(calibrated.result, seen_in(calibrated), recording, repeats)
+
+
+@one_blas_thread()
+def evaluate(
+    recording: Recording,
+    calibrated: Calibrated,
+    options: CalibrationOptions,
+    qa: QaOptions,
+    progress: Progress = silent,
+) -> Metrics:
+    """Return all figures of a calibration: with the map around it; parameters as ``measured``."""
+    repeats, seen = repeats_of(recording, calibrated, options, qa, progress), seen_in(calibrated)
     progress(FIGURES, 0.0)
-    picture = map_picture(maps.anywhere, seen.places)  # by all cores
-    metrics = metrics_of(calibrated.result, seen, recording, picture, repeats)
+    picture = map_picture(calibrated.field_map, seen.places)  # by all cores
+    found = measures_of(calibrated.result, seen, recording, repeats)
     progress(FIGURES, 0.5)
-    return metrics
+    return Metrics(found.sensors, found.drive, picture, bags=found.bags)
+
+
+def seen_in(calibrated: Calibrated) -> SeenSensors:
+    """Return what the map and a calibration make of a drive's readings."""
+    return SeenSensors.of(calibrated.result, evidence_of(calibrated), calibrated.solver_map)
 
 
 def repeats_of(
@@ -94,11 +110,6 @@ def evidence_of(calibrated: Calibrated) -> DriveEvidence:
     """Return the readings of a calibration as its solve left them."""
     solution = calibrated.solution
     return DriveEvidence(solution.readings, solution.inside, solution.rejected)
-
-
-def maps_of(calibrated: Calibrated) -> MapForms:
-    """Return the map of a calibration in both its forms."""
-    return MapForms(calibrated.field_map, calibrated.solver_map)
 
 
 @one_blas_thread()

@@ -7,7 +7,7 @@ import numpy as np
 from l2m_gtsam.calibration.calibrate import Calibrated
 from l2m_gtsam.data import FloatArray, Recording, Trajectory
 from l2m_gtsam.parallel.threads import one_blas_thread
-from l2m_gtsam.qa.evaluate import evidence_of, maps_of
+from l2m_gtsam.qa.evaluate import evidence_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, Queryable, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import curves
 from l2m_gtsam.qa.metrics.plain import evenly
@@ -31,14 +31,13 @@ def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:
     calibrated
         The calibration, with what it rests on.
     """
-    evidence, maps = evidence_of(calibrated), maps_of(calibrated)
+    evidence = evidence_of(calibrated)
     solved = [each for each in calibrated.result.sensors if each.residuals is not None]
-    sensors = tuple(_sensor(each, evidence, maps.along_drive) for each in solved)
+    sensors = tuple(_sensor(each, evidence, calibrated.solver_map) for each in solved)
     places = np.concatenate([each.place for each in sensors])
     drives = [each.trajectory for each in recording.parts]
-    return Scene(
-        recording.source.sha256, map_view(maps.anywhere, places), drive_views(drives), sensors
-    )
+    seen = map_view(calibrated.field_map, places)
+    return Scene(recording.source.sha256, seen, drive_views(drives), sensors)
 
 
 def map_view(field_map: Queryable, places: FloatArray) -> MapView:

@@ -5,7 +5,7 @@ does not exist is NaN. Rows of axes are in the order x, y, z.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 from l2m_gtsam.records.record import Record
@@ -489,8 +489,8 @@ class DriveMetrics(Record):
 
 
 @dataclass(frozen=True)
-class Metrics(Record):
-    """All figures of one calibration.
+class Measures(Record):
+    """The figures of one calibration that its verdict rests on.
 
     Attributes
     ----------
@@ -498,17 +498,27 @@ class Metrics(Record):
         Those that were solved.
     drive
         How the vehicle moved.
-    map
-        Around it.
     bags
         Paths of several drives, in the order in which series count them.
     """
 
     sensors: tuple[SensorMetrics, ...]
     drive: DriveMetrics
-    map: MapPicture
-    bags: tuple[str, ...] | None = None
+    bags: tuple[str, ...] | None = field(default=None, kw_only=True)
 
     def get(self, sensor: str) -> SensorMetrics | None:
         """Return the figures of a sensor; none if it was not solved."""
         return next((each for each in self.sensors if each.sensor == sensor), None)
+
+
+@dataclass(frozen=True)
+class Metrics(Measures):
+    """All figures of one calibration.
+
+    Attributes
+    ----------
+    map
+        Around the drive.
+    """
+
+    map: MapPicture

@@ -20,20 +20,12 @@ from l2m_gtsam.qa.metrics.mounting import mounting
 from l2m_gtsam.qa.metrics.plain import row, rows
 from l2m_gtsam.qa.metrics.repeatability import NOT_DONE, SEVERAL, no_halves
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
-from l2m_gtsam.records.metrics import Halves, MapPicture, Metrics, Repeatability, SensorMetrics
+from l2m_gtsam.records.metrics import Halves, MapPicture, Measures, Repeatability, SensorMetrics
 
 DRAWN = 6000  # readings of all sensors together, so that a report stays small
 FEWEST, MOST = 100, 500  # of each
 CELLS = 120  # along the longer side of the map's picture
 AROUND, MOST_AROUND_M = 0.15, 1.0  # of the drive, on each side: no tile is read for far places
-
-
-@dataclass(frozen=True)
-class MapForms:
-    """One map in two forms: asked at few places anywhere, and fast along the drive."""
-
-    anywhere: Queryable
-    along_drive: Queryable
 
 
 @dataclass(frozen=True)
@@ -78,13 +70,9 @@ def solved_sensors(result: CalibrationResult) -> list[SensorCalibration]:
     return [each for each in result.sensors if each.residuals is not None]
 
 
-def metrics_of(
-    result: CalibrationResult,
-    seen: SeenSensors,
-    recording: Recording,
-    picture: MapPicture,
-    repeats: Repeats,
-) -> Metrics:
+def measures_of(
+    result: CalibrationResult, seen: SeenSensors, recording: Recording, repeats: Repeats
+) -> Measures:
     """Return the figures of all sensors that were solved, and of the drive.
 
     Parameters
@@ -93,8 +81,6 @@ def metrics_of(
         Its readings.
     recording
         What was calibrated.
-    picture
-        The map around them.
     repeats
         Comparisons of parts, as far as there are some.
     """
@@ -105,7 +91,7 @@ def metrics_of(
         _sensor(each, seen.sensors[each.sensor], repeats, start_ns, most) for each in solved
     )
     bags = tuple(each.source.path for each in recording.drives) or None
-    return Metrics(sensors, drive_metrics(recording), picture, bags)
+    return Measures(sensors, drive_metrics(recording), bags=bags)
 
 
 def starts_of(evidence: DriveEvidence) -> IntArray:

@@ -19,14 +19,14 @@ from l2m_gtsam.records.calibration import (
     SensorStatus,
 )
 from l2m_gtsam.records.error_budget import DurationSource
-from l2m_gtsam.records.metrics import Metrics, SensorMetrics
+from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
 
 OPEN = (SensorStatus.UNDETERMINED, SensorStatus.NOT_CONVERGED, SensorStatus.NO_READINGS)
 MANY = 4  # stretches that are listed one by one
 
 
-def judge(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> Verdict:
+def judge(result: CalibrationResult, metrics: Measures, options: QaOptions) -> Verdict:
     """Return the verdict on a calibration.
 
     Parameters
@@ -43,7 +43,7 @@ def judge(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> Ve
     return Verdict.of(_shared_reasons(cases, result), [_on_sensor(case) for case in cases])
 
 
-def judgement_of(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> Judgement:
+def judgement_of(result: CalibrationResult, metrics: Measures, options: QaOptions) -> Judgement:
     """Return the verdict with its thresholds, and what was judged before by other thresholds.
 
     Parameters

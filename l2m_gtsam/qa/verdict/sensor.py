@@ -13,7 +13,7 @@ from l2m_gtsam.records.calibration import (
     SensorStatus,
     Uncertainty,
 )
-from l2m_gtsam.records.metrics import Metrics, SensorMetrics
+from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Level, Reason
 
 HEADS = {
@@ -50,7 +50,7 @@ class Case:
     sensor: SensorCalibration
     metrics: SensorMetrics | None
     result: CalibrationResult
-    all: Metrics
+    all: Measures
     options: QaOptions
 
     @property

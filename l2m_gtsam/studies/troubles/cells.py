@@ -11,7 +11,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.parts_alone import ByParts
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.errors import L2MError
-from l2m_gtsam.qa.evaluate import evaluate
+from l2m_gtsam.qa.evaluate import measured
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
@@ -114,10 +114,10 @@ def judged_drive(
     chosen = CalibrationOptions(solve=OneKeyOptions(pose_noise=poses))
     try:
         found = calibrated(recording, place.field_map, chosen)
-        metrics = evaluate(recording, found, chosen, QaOptions())
+        measures = measured(recording, found, chosen, QaOptions())
     except L2MError:
         return [JudgedSensor(Level.FAIL.value, None, None, None, None, 1.0)] * len(truth)
-    verdict = judge(found.result, metrics, QaOptions())
+    verdict = judge(found.result, measures, QaOptions())
     judged = [
         judged_sensor(each, known, verdict.level)
         for each, known in zip(found.result.sensors, truth, strict=True)
