@@ -117,7 +117,7 @@ class StandIns:
 
     @classmethod
     def of(cls, readings: Readings, most: int) -> "StandIns":
-        """Take at most so many readings of each sensor."""
+        """Take at most so many readings of each sensor, two at least."""
         few, every = np.flatnonzero(spread(readings, most)), np.arange(len(readings))
         # The first and the last reading of each sensor are among them: both neighbours are its own.
         after = np.searchsorted(few, every)

@@ -53,6 +53,26 @@ def test_jacobians_match_central_differences(seed: int) -> None:
         assert_jacobians_match(factor, values, rtol=1e-6, step=2e-5)
 
 
+@settings(max_examples=12)
+@given(seed=st.integers(0, 10_000))
+def test_white_jacobians_are_those_of_the_factor(seed: int) -> None:
+    """Column by column in the order of the keys, with a time offset and without, C fixed or not."""
+    world, sensors = dipole_world(seed), random_sensors(seed, 2)
+    readings, values = as_magnetic(drive(seed, sensors, world, count=4)), random_values(seed, 2)
+    W = np.tril(np.random.default_rng(seed).normal(size=(8, 3, 3)))
+    for batch in (
+        BatchedReadings(world, readings),
+        BatchedReadings(world, with_motion(readings, seed)),
+        BatchedReadings(world, readings, fixed_distortion(values, 2)),
+    ):
+        rows = batch.rows_of(1)
+        parts = batch.white_jacobians(batch.residuals(values, 1), rows, W[rows])
+        whole = batch.jacobian(batch.residuals(values, 1))[rows]
+        expected = (W[rows] @ whole).reshape(3 * len(rows), -1)
+        # Products of three numbers, summed in another order.
+        np.testing.assert_allclose(np.hstack(parts), expected, rtol=1e-12, atol=1e-10)
+
+
 def test_prior_jacobians_match() -> None:
     rng = np.random.default_rng(5)
     values = random_values(5, 1)

@@ -1,6 +1,8 @@
 """Roots of covariances: they multiply to the matrix they were taken of, singular ones too."""
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from l2m_gtsam.solve.linear_algebra import (
     correlation_factor,
@@ -10,6 +12,7 @@ from l2m_gtsam.solve.linear_algebra import (
     lower_information_root,
     right_divided,
     triangular_information_root,
+    triangular_rows,
 )
 
 
@@ -94,3 +97,14 @@ def test_of_equal_eigenvalues_all_vectors_lead() -> None:
     for matrix in (np.zeros((3, 3)), 2.0 * np.eye(3)):
         found = leading_eigenvectors(matrix, 1e-7)
         np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-15)
+
+
+@given(seed=st.integers(0, 2**32 - 1), rows=st.integers(1, 60), columns=st.integers(1, 16))
+def test_triangular_rows_have_the_same_squares(seed: int, rows: int, columns: int) -> None:
+    """Also with fewer rows than columns."""
+    given_rows = np.random.default_rng(seed).normal(size=(rows, columns))
+    R = triangular_rows(given_rows)
+    assert R.shape == (min(rows, columns), columns)
+    np.testing.assert_array_equal(R, np.triu(R))
+    # Rounding of at most 60 products of numbers of order one.
+    np.testing.assert_allclose(R.T @ R, given_rows.T @ given_rows, rtol=0, atol=1e-11)

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.calibration import Return
+from l2m_gtsam.solve.noise import NOISE_RANGE
 from l2m_gtsam.solve.robust import (
     WEIGHTS,
     JudgedReadings,
@@ -81,6 +82,21 @@ def test_noise_withstands_a_third_of_wrong_readings() -> None:
     e[::3] += 50.0
     # A third of wrong ones makes the median of all the 75th percentile of the good ones.
     assert 0.2 < median_noise(e, variance) < 0.35
+
+
+@given(seed=st.integers(0, 2**32 - 1), half=st.integers(0, 40))
+def test_half_of_the_readings_are_within_the_median_of_noise(seed: int, half: int) -> None:
+    """With an odd number of them one is at the median itself, whatever the map does not know."""
+    rng = np.random.default_rng(seed)
+    variance = rng.uniform(0.0, 0.5, 2 * half + 1)
+    e = rng.normal(0, 3.0, (2 * half + 1, 3)) + 2.0  # beyond what the map's variance explains
+    noise = median_noise(e, variance)
+    r2 = np.einsum("ni,ni->n", e, e) / (noise**2 + variance)
+    if noise > NOISE_RANGE[0]:
+        # Rounding of a square and its root.
+        assert np.median(r2) == pytest.approx(chi2.ppf(0.5, 3), rel=1e-9)
+    else:
+        assert np.median(r2) <= chi2.ppf(0.5, 3)
 
 
 @given(seed=st.integers(0, 1000), share=st.floats(0.0, 0.3), size=st.floats(3.0, 100.0))
