@@ -129,7 +129,7 @@ def alternate(
     It only has to come near: `alternation_readings` of each sensor are enough, with the map's
     variance at fewer yet, which is asked for anew only where sensors have moved.
     """
-    estimate, furthest, last = start, options.settled_m, 0.0
+    estimate, furthest = start, options.settled_m
     view, asked, step = glimpse(readings, stand_ins, field_map, start, start.t, FEWEST), start.t, 0
     while view.sensors and step < options.max_steps:
         step += 1
@@ -137,9 +137,8 @@ def alternate(
         move = float(np.abs(moved.t - estimate.t).max())
         estimate, furthest = moved, max(furthest, move)
         progress("alternation", _share_done(move, furthest, options.settled_m))
-        if min(move, _left(move, last)) <= options.settled_m:
+        if move <= options.settled_m:
             break
-        last = move
         if np.abs(estimate.t - asked).max() <= NEAR_M:
             view = seen_from(view, field_map, estimate)
         else:
@@ -179,11 +178,6 @@ def move_sensors(
     graph.push_back(estimate.priors.of_places(view.sensors))
     optimised = optimise(graph, start, options.optimizer, options.graph_iterations)
     return estimate.updated(optimised.values, view.sensors)
-
-
-def _left(move: float, last: float) -> float:
-    """Return how far it is yet: moves shrink like a geometric series, as the loop converges."""
-    return move**2 / (last - move) if last > move else move
 
 
 def _share_done(move: float, furthest: float, settled: float) -> float:
