@@ -196,7 +196,6 @@ def seen_from(view: View, field_map: QueryableMap, estimate: Estimate) -> View:
 
 
 MOST = 500_000  # places that are remembered: 100 MB
-FEW = 8  # of the places wanted: are any of these known?
 VALUES = 15  # field, gradient and variance
 
 
@@ -307,7 +306,7 @@ def remembered(field_map: QueryableMap) -> RememberedMap:
 
 
 def rows_among(known: FloatArray, wanted: FloatArray) -> IntArray:
-    """Return in which row of known places each wanted one is, -1 if it is not found, shape (M,).
+    """Return in which row of known places each wanted one is, -1 where in none, shape (M,).
 
     Parameters
     ----------
@@ -316,12 +315,10 @@ def rows_among(known: FloatArray, wanted: FloatArray) -> IntArray:
     """
     if np.array_equal(known, wanted):
         return np.arange(len(known))
-    # Where none of a few is known, as most often, sensors have moved. The others are not looked
-    # for: one that is not found is asked for anew.
-    numbers, few = _numbers(known), _numbers(wanted[:: max(1, len(wanted) // FEW)])
-    if not (numbers[:, None] == few).any():
+    numbers, wanted_numbers = _numbers(known), _numbers(wanted)
+    together = np.sort(np.concatenate([numbers, wanted_numbers]))
+    if not len(known) or not (together[1:] == together[:-1]).any():  # as most often: all moved
         return np.full(len(wanted), -1)
-    wanted_numbers = _numbers(wanted)
     order = np.argsort(numbers)
     at = np.searchsorted(numbers, wanted_numbers, sorter=order)
     found = order[np.minimum(at, len(known) - 1)]
