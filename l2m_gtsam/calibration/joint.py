@@ -22,6 +22,7 @@ from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.optimise import (
     NEARLY,
+    TOLERANCE,
     Ending,
     JointCovariance,
     covariance_by_qr,
@@ -206,13 +207,15 @@ def joint_step(
     """Optimise T(i), D(i), S(i) of all sensors, then the noise from the residuals that remain.
 
     With the weights of an intermediate stage a descent that has nearly ended is enough. ``exact``
-    goes on from the end of such a descent to where the gradient vanishes, if the way is not uphill.
+    goes on from the end of such a descent to where the gradient vanishes; if that way is uphill, it
+    descends to the end.
     """
     sensors = problem.view.sensors
     start, steps = estimate.values(sensors), options.joint_iterations
     optimised = polish(problem.graph, start, POLISHING_STEPS) if exact else None
     if optimised is None or optimised.ending is not Ending.TOLERANCE:
-        optimised = optimise(problem.graph, start, options.optimizer, steps, tolerance=NEARLY)
+        enough = TOLERANCE if exact else NEARLY
+        optimised = optimise(problem.graph, start, options.optimizer, steps, tolerance=enough)
     after = estimate.updated(optimised.values, sensors)
     most = options.largest_offset_s
     after = replace(after, offset=np.clip(after.offset, -most, most))
