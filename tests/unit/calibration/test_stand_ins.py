@@ -5,23 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2m_gtsam.calibration.view import StandIns, places_of
-from l2m_gtsam.data import FieldSample, FloatArray
+from tests.worlds.counting import Counting
 from tests.worlds.exact import dipole_world, drive, random_sensors
-
-
-class Counting:
-    """A world with a made-up variance that counts the places it is asked for."""
-
-    def __init__(self) -> None:
-        self.world, self.asked = dipole_world(1), 0
-
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
-        return self.world.field_and_gradient(points)
-
-    def query(self, points: FloatArray, /) -> FieldSample:
-        self.asked += len(points)
-        field, gradient = self.world.field_and_gradient(points)
-        return FieldSample(field, gradient, points**2, points[:, 0] > 0)
 
 
 @settings(max_examples=30)
