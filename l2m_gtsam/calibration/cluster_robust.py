@@ -300,9 +300,9 @@ def halved(points: FloatArray, times: int) -> IntArray:
         one halving less.
     """
     part = np.zeros(len(points), dtype=np.int64)
-    for level in range(times):
+    for _ in range(times):
         later = np.zeros(len(points), dtype=np.bool_)
-        for label in range(2**level):
+        for label in np.unique(part):
             rows = np.flatnonzero(part == label)
             axis = int(np.ptp(points[rows], axis=0).argmax())
             order = rows[np.argsort(points[rows, axis], kind="stable")]

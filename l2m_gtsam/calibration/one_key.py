@@ -250,11 +250,12 @@ def _solved(
 ) -> OneKeySolution:
     field_map = remembered(field_map)
     stand_ins = StandIns.of(readings, options.fewer_readings)
-    some = spread(readings, options.some_readings)
-    sample = stand_ins.select(some).sample(readings.select(some), field_map, t_start, t_start)
-    some[some] = plausible(readings.select(some), sample, options.robust)
-    start, of_some = start_estimate(t_start, options, priors), stand_ins.select(some)
-    near = alternate(readings.select(some), of_some, field_map, start, options, progress)
+    keep = spread(readings, options.some_readings)
+    some, of_some = readings.select(keep), stand_ins.select(keep)
+    good = plausible(some, of_some.sample(some, field_map, t_start, t_start), options.robust)
+    some, of_some = some.select(good), of_some.select(good)
+    start = start_estimate(t_start, options, priors)
+    near = alternate(some, of_some, field_map, start, options, progress)
     joint = settle(readings, stand_ins, field_map, near, options, progress, trajectory)
     outcome = OneKeySolution(
         readings=joint.readings,

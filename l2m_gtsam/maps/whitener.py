@@ -39,8 +39,8 @@ class Whitener:
     def of(cls, factor: FloatArray) -> "Whitener":
         """Invert a lower Cholesky factor, shape (M, M) in uT, which is overwritten."""
         inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)
-        ends = [min(start + STRIPE, len(inverse)) for start in range(0, len(inverse), STRIPE)]
-        stripes = [inverse[end - 1 - (end - 1) % STRIPE : end, :end].ravel() for end in ends]
+        starts = range(0, len(inverse), STRIPE)
+        stripes = [inverse[start : start + STRIPE, : start + STRIPE].ravel() for start in starts]
         first = np.cumsum([0, *(stripe.size for stripe in stripes)])
         return cls(np.concatenate(stripes), first)
 
