@@ -65,6 +65,10 @@ class OneKeyOptions(Options):
     pose_noise: PoseNoiseOptions = PoseNoiseOptions()
     """How wrong the lidar's poses are. With `uncertainty: independent` each reading has a pose
     error of its own."""
+    warp_m: float = Field(default=0.01, ge=0)
+    """How far the drive's frame may be bent against the map's, beforehand: standard deviation of
+    shifts along the floor in metres. What readings leave possible of it is in the sigmas; 0 where
+    both frames are one, as by motion capture."""
     robust: RobustOptions = RobustOptions()
     """What becomes of readings that the map and one distortion cannot explain."""
     moving_field_ut: float = Field(default=50.0, gt=0)

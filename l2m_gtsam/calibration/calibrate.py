@@ -163,6 +163,7 @@ def calibrated(
         disturbances=solution.budget.named(alive.sensors),
         stated=solution.stated,
         pose_duration=solution.pose_duration,
+        unseen_warp_m=solution.unseen_warp_m,
         sources=changed.records,
     )
     return Calibrated(result, solution, field_map, solver_map)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, fit_distortions, start_estimate
-from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution, joint_problem, sensor_solutions
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
@@ -164,4 +164,8 @@ def _uncertain(
     drive = UncertainDrive.of(view, field_map, errors, estimate, options)
     values = starting_values(estimate, view.sensors, drive.prior.coverage)
     problem = UncertainProblem(drive, estimate, tests, options.factors)
-    return UncertainOptimum.at(problem, values).solutions()
+    optimum = UncertainOptimum.at(problem, values)
+    solved = optimum.solutions()
+    if options.warp_m > 0 and sigmas_hold(errors):
+        return optimum.with_unseen(solved, optimum.unseen_warp(options.warp_m))
+    return solved

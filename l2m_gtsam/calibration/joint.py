@@ -33,7 +33,7 @@ from l2m_gtsam.calibration.optimise import (
 from l2m_gtsam.calibration.pose_errors import error_of_poses
 from l2m_gtsam.calibration.priors import Contradiction, contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
-from l2m_gtsam.calibration.variance_parts import Parts
+from l2m_gtsam.calibration.variance_parts import Parts, by_block
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.calibration import ResidualFigures
@@ -114,6 +114,27 @@ class SensorSolution:
             joint_covariance=covariance,
             shared_root=None if root is None else scale[:-1, None] * root,
             unmodelled=excess.factors,
+        )
+
+    def with_shared_error(self, cause: ErrorCause, root: FloatArray) -> "SensorSolution":
+        """Return the same with an error that is not in the graph and that all sensors share.
+
+        Parameters
+        ----------
+        cause
+            Whose error.
+        root
+            This sensor's rows, with the time offset, of a root of its covariance, shape (16, m).
+        """
+        added, known = root @ root.T, np.isfinite(np.diag(self.joint_covariance))
+        covariance = self.joint_covariance + np.where(np.outer(known, known), added, 0.0)
+        own = [] if self.shared_root is None else [self.shared_root]
+        part = self.variances.get(cause, np.zeros(3)) + by_block(np.diag(added))
+        return replace(
+            self,
+            joint_covariance=covariance,
+            shared_root=np.hstack([*own, root[:-1]]) if own else None,
+            variances={**self.variances, cause: part},
         )
 
     def with_spread_of_H(self, spread: FloatArray) -> "SensorSolution":

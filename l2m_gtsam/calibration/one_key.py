@@ -106,6 +106,8 @@ class OneKeySolution:
         How long errors of poses last; none where these are taken for exact, or no map was asked.
     by_parts
         The sensors by the scatter of parts of the drive alone, where that is asked for.
+    unseen_warp_m
+        As of ``UncertainSolution``.
     """
 
     readings: Readings
@@ -121,6 +123,7 @@ class OneKeySolution:
     stated: tuple[StatedSize, ...] = ()
     pose_duration: PoseDuration | None = None
     by_parts: tuple[ByParts, ...] = ()
+    unseen_warp_m: float | None = None
 
     @property
     def used(self) -> BoolArray:
@@ -291,6 +294,7 @@ def _solved(
         stated=full.stated,
         pose_duration=duration,
         by_parts=full.by_parts,
+        unseen_warp_m=full.unseen_warp_m,
     )
 
 

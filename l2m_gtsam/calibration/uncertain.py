@@ -61,6 +61,9 @@ class UncertainSolution:
         How large errors are whose sigmas were stated.
     by_parts
         The sensors by the scatter of parts of the drive alone, where that is asked for.
+    unseen_warp_m
+        Shifts of the drive's frame that readings leave possible, metres, root mean square; absent
+        where they are estimated or not counted.
     """
 
     estimate: Estimate
@@ -70,6 +73,7 @@ class UncertainSolution:
     budget: Budget = NOTHING_FOUND
     stated: tuple[StatedSize, ...] = ()
     by_parts: tuple[ByParts, ...] = ()
+    unseen_warp_m: float | None = None
 
 
 def solve_uncertain(
@@ -119,12 +123,21 @@ def solve_uncertain(
             start.values,
         )
     optimum = found.optimum
-    solved = optimum.by_cause(optimum.solutions())
+    solved, size = optimum.by_cause(optimum.solutions()), None
+    if searched and options.warp_m > 0 and found.drive.budget.warp is None:
+        unseen = optimum.unseen_warp(options.warp_m)
+        solved, size = optimum.with_unseen(solved, unseen), unseen.size_m
     scattered, halved = side_by_side(optimum.scattered, lambda: optimum.halved(solved))
     solved = optimum.wandering(optimum.robust(halved, scattered))
     progress(1.0)
     return UncertainSolution(
-        found.estimate, solved, found.ending, found.settled, found.drive.budget, stated
+        estimate=found.estimate,
+        solved=solved,
+        ending=found.ending,
+        settled=found.settled,
+        budget=found.drive.budget,
+        stated=stated,
+        unseen_warp_m=size,
     )
 
 

@@ -10,8 +10,14 @@ import numpy as np
 from l2m_factors import D, Q, U, W
 from l2m_gtsam.calibration.budget.found import spread_of_H
 from l2m_gtsam.calibration.budget.looked_for import processes
-from l2m_gtsam.calibration.budget.processes import ReadingPlaces
-from l2m_gtsam.calibration.budget.search import Searched, process_information, search
+from l2m_gtsam.calibration.budget.processes import Process, ReadingPlaces, Warp
+from l2m_gtsam.calibration.budget.search import (
+    ProcessInformation,
+    Searched,
+    process_information,
+    search,
+)
+from l2m_gtsam.calibration.budget.unseen_warp import UnseenWarp, unseen_warp
 from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.coverage import Coverage
 from l2m_gtsam.calibration.half_difference import (
@@ -109,13 +115,20 @@ class UncertainOptimum:
 
     def searched(self) -> Searched:
         """Return the processes that are not in the graph, and that its residuals show."""
-        problem = self.problem
-        places = ReadingPlaces.of(self._view.readings, problem.drive.field_map, problem.estimate)
-        looked_for, rows = processes(places, self._view.sensors), self._rows
-        known = process_information(
-            looked_for, self.joint, rows, problem.noise.whitenings, places.C
+        return search(self._informed(processes(self._places, self._view.sensors)))
+
+    def unseen_warp(self, before_m: float) -> UnseenWarp:
+        """Return the bend of the frame that residuals leave possible; none is in the graph."""
+        return unseen_warp(self._informed([Warp.of(self._places)]), before_m)
+
+    def with_unseen(
+        self, solved: Sequence[SensorSolution], unseen: UnseenWarp
+    ) -> tuple[SensorSolution, ...]:
+        """Return solutions whose covariances hold a bend that is not in the graph."""
+        return tuple(
+            each.with_shared_error(ErrorCause.WARP, unseen.root[self._columns(each.sensor)])
+            for each in solved
         )
-        return search(known)
 
     def scattered(self) -> dict[int, tuple[Scatter, ...]]:
         """Return how each sensor's parameters scatter over parts of the drive."""
@@ -192,6 +205,16 @@ class UncertainOptimum:
     @property
     def _view(self) -> View:
         return self.problem.drive.view
+
+    @cached_property
+    def _places(self) -> ReadingPlaces:
+        problem = self.problem
+        return ReadingPlaces.of(self._view.readings, problem.drive.field_map, problem.estimate)
+
+    def _informed(self, looked_for: Sequence[Process]) -> ProcessInformation:
+        """Return what readings say of processes that are not in the graph."""
+        white = self.problem.noise.whitenings
+        return process_information(looked_for, self.joint, self._rows, white, self._places.C)
 
     @property
     def _coverage(self) -> Coverage:

@@ -379,6 +379,9 @@ class CalibrationResult:
         How long errors of poses last; none where these are taken for exact.
     sources
         Of field that came, went or were moved since the place was mapped; the solve includes them.
+    unseen_warp_m
+        Shifts of the drive's frame against the map's that readings leave possible, root mean square
+        along each axis of the floor in metres; sigmas hold them. Absent where a bend was found.
     """
 
     sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]
@@ -399,6 +402,7 @@ class CalibrationResult:
     sources: tuple[ChangedSource, ...] = ()
     stated: tuple[StatedSize, ...] = ()
     pose_duration: PoseDuration | None = None
+    unseen_warp_m: float | None = None
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

@@ -108,10 +108,17 @@ MODEL = {
         "how long errors of poses last, whose sizes were stated: the correlation of two falls to "
         "1/e over this time; given, found in the readings, or assumed"
     ),
+    "unseen_warp_m": (
+        "shifts of the drive's frame against the map's that readings leave possible, metres, root "
+        "mean square along each axis of the floor; covariances hold them"
+    ),
     "traces": "some poses of each drive, by which validate recognises it whatever file it is in",
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
-OPTIONAL = ("notes", "exact", "disturbances", "stated", "pose_duration", "traces", "sources")
+OPTIONAL = (
+    *("notes", "exact", "disturbances", "stated", "pose_duration", "unseen_warp_m"),
+    *("traces", "sources"),
+)
 SENSOR_KEYS = (
     *("status", "message", "t_lidar_mag", "t_sigma", "C", "C_sigma", "H", "H_sigma"),
     *("R_lidar_mag", "rotation_sigma", "rotation_covariance", "transforms", "noise"),
@@ -159,6 +166,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "disturbances": plain["disturbances"],
         "stated": plain["stated"],
         "pose_duration": plain["pose_duration"],
+        "unseen_warp_m": plain["unseen_warp_m"],
         "disagreements": disagreements,
         "sources": plain["sources"],
         **source_entries(result),

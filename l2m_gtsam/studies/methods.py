@@ -157,7 +157,8 @@ def bound_at(
     view = observe(readings, field_map, truth, options.min_readings)
     if not view.sensors:
         return np.full((16, 16), np.nan)
-    shared = options.model_copy(update={"uncertainty": Uncertainty.FULL})
+    # A bound knows that the drive's frame is the map's.
+    shared = options.model_copy(update={"uncertainty": Uncertainty.FULL, "warp_m": 0.0})
     (solution,) = stated_at(view, field_map, truth, shared).solved
     return solution.joint_covariance
 

@@ -48,6 +48,11 @@ class Budget:
         own = [each for each in self.found if each.process.kind is DisturbanceKind.POSES]
         return own[0] if own else None
 
+    @property
+    def warp(self) -> FoundProcess | None:
+        """The bend of the frame, if there is one."""
+        return self.variables.get(F())
+
     def lasting(self, stated_s: float) -> float:
         """Return how long errors of poses last: as found, or else as stated."""
         return stated_s if self.poses is None else LASTING_S[self.poses.form]

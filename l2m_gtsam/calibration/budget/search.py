@@ -105,6 +105,13 @@ class ProcessInformation:
     joint: JointInformation
     across: FloatArray
 
+    @property
+    def influence(self) -> FloatArray:
+        """By how much a unit of each weight is off all variables of the graph, shape (n, M)."""
+        joint = self.joint
+        loose = joint.loose @ (joint.loose.T @ self.across)
+        return np.asarray(loose - joint.every.times(self.across))
+
     def searched(self, found: Sequence[FoundProcess], noise: float) -> Searched:
         """Return processes with the weights that are most likely beside so much of the noise."""
         own = [self.columns[self.processes.index(each.process)] for each in found]

@@ -82,6 +82,11 @@ def _exact(result: CalibrationResult) -> list[Reason]:
     if (lasting := result.pose_duration) and lasting.source is DurationSource.FOUND:
         text = f"Errors of poses last {lasting.seconds:.2g} s, by the readings."
         reasons.append(Reason(Level.PASS, text))
+    if size := result.unseen_warp_m:
+        text = (
+            f"A bend of the drive's frame by {1e3 * size:.1f} mm would not be seen; sigmas hold it."
+        )
+        reasons.append(Reason(Level.PASS, text))
     if result.exact:
         reasons.append(Reason(Level.PASS, f"Taken for exact: {', '.join(result.exact)}."))
     return reasons

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import Calibrated
 from l2m_gtsam.data import KnownSensor
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
@@ -63,6 +64,17 @@ def test_a_wandering_offset_is_sized() -> None:
     # Draws of three walks each: their size is known to a third.
     for each in found:
         assert each.sizes["walk_ut"] == pytest.approx(OPTIONS.drift_ut, rel=0.5)
+
+
+def test_a_bend_that_is_not_found_is_counted_and_said() -> None:
+    clean, _, verdict = drive(Trouble.CLEAN)
+    size, before = clean.result.unseen_warp_m, OneKeyOptions().warp_m
+    assert size is not None
+    assert 0 < size < before
+    assert any("would not be seen; sigmas hold it" in each.text for each in verdict.reasons)
+    # One that is found is estimated.
+    assert shown(Trouble.WARP, DisturbanceKind.WARP)
+    assert drive(Trouble.WARP)[0].result.unseen_warp_m is None
 
 
 def test_errors_of_poses_are_sized_and_no_longer_taken_for_exact() -> None:

@@ -31,8 +31,8 @@ from tests.drives.uncertain import (
 )
 from tests.worlds.exact import DipoleWorld
 
-FULL, INDEPENDENT = (
-    OneKeyOptions(uncertainty=kind, sensor_noise_ut=NOISE)
+FULL, INDEPENDENT = (  # the drive's frame is the map's
+    OneKeyOptions(uncertainty=kind, sensor_noise_ut=NOISE, warp_m=0)
     for kind in (Uncertainty.FULL, Uncertainty.INDEPENDENT)
 )
 

@@ -27,6 +27,7 @@ from tests.drives.uncertain import (
 LASTS_S = 0.7
 OPTIONS = OneKeyOptions(
     sensor_noise_ut=NOISE,
+    warp_m=0,
     pose_noise=PoseNoiseOptions(correlation_s=LASTS_S),
     robust=RobustOptions(loss=Loss.SQUARED),
 )
