@@ -23,7 +23,7 @@ from l2m_gtsam.slam.unknown_field.kept_odometry import with_gain
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution
 from l2m_gtsam.slam.unknown_field.tiled_stages import map_drive
-from l2m_gtsam.slam.unknown_field.tiles import drive_prior
+from l2m_gtsam.slam.unknown_field.tiles import drive_prior, larger
 from l2m_gtsam.slam.unknown_field.whole_smoother import DriveLikelihood, map_whole_drive
 
 NO_REVISITS = "no place was revisited: readings of an unknown field remove little drift then"
@@ -171,7 +171,7 @@ def where_gained(drive: Drive, mapped: FieldSolution, options: SlamOptions) -> F
     prior = drive_prior(drive, without_field(drive, options).poses, options.tiles)
     recorded = with_recorded_jumps(drive)
     odometry = without_field(recorded, options).poses
-    return with_gain(mapped, recorded, odometry, prior, options)
+    return with_gain(mapped, recorded, odometry, larger(prior), options)
 
 
 def explored_result(result: LocalisationResult, explored: Explored) -> LocalisationResult:

@@ -60,6 +60,9 @@ class TileOptions(Options):
     """The box of a tile's waves reaches so far beyond its core."""
     modes: int = Field(default=200, ge=30, le=1000)
     """The most waves of a tile. What shorter ones would hold counts as noise."""
+    last_core: float = Field(default=5.0, gt=0.5, le=20)
+    """Size of tiles in the last stage off line, if it is larger than `core`, with as many more
+    waves: larger tiles connect more of the path, where it is known well enough for them."""
     learn_over_m: float = Field(default=20.0, gt=0)
     """Path length from the start over which strength and depth of the sources are learnt: over it
     odometry has to be better than the field's detail."""
@@ -70,6 +73,13 @@ class TileOptions(Options):
     def edge(self) -> float:
         """Edge of a tile's box in metres."""
         return self.core + 2 * self.margin
+
+    @property
+    def last(self) -> "TileOptions":
+        """Tiles of the last stage off line: waves as short as in others, over larger boxes."""
+        larger = self.model_copy(update={"core": max(self.core, self.last_core)})
+        waves = round(self.modes * (larger.edge / self.edge) ** 2)
+        return larger.model_copy(update={"modes": waves})
 
 
 class WholeFieldOptions(Options):

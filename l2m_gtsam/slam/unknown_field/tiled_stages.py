@@ -2,7 +2,8 @@
 
 First the noise of readings is scaled up, so that only the field's long waves matter, and a
 revisited place is recognised from further off; then it is reduced. At each stage tiles are laid out
-anew at the current poses, and readings that no tile explains lose their weight.
+anew at the current poses, and readings that no tile explains lose their weight. Those of the last
+stage are larger: they take more time, and connect more of the path.
 
 Odometry drifts out of the reach of the longest waves, too. So the drive is first followed coarsely,
 piece by piece: each is initialised by the one before, and where it comes back to is searched for
@@ -12,6 +13,7 @@ Fields are taken to last. Only where a visit then finds another field (:mod:`.re
 the drive solved again with tiles that end there, and the likelier of both solutions is kept.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -35,7 +37,7 @@ from l2m_gtsam.slam.unknown_field.tiled_smoother import (
     TiledProblem,
     TiledRound,
 )
-from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, coarser
+from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, coarser, larger
 
 FOLLOWED = (16.0, 1.0)  # factor of the readings' noise, convexity of the loss (``solve.robust``)
 JUDGED = (4.0, 1.0)  # the same, with which two solutions of a piece are compared
@@ -73,7 +75,7 @@ def map_drive(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    lasting = StagedDrive(drive, prior, options, partial(TiledDrive.lasting, prior=prior))
+    lasting = StagedDrive(drive, prior, options, TiledDrive.lasting)
     found = lasting.solved(initial, progress)
     if not finds_changes(found.solution.drive, found.solution.poses, prior):
         return found
@@ -81,8 +83,7 @@ def map_drive(
     def again(stage: str, done: float) -> None:
         progress(f"{stage}, with moved steel", done)
 
-    renewed = replace(lasting, divided=partial(TiledDrive.renewed, prior=prior))
-    changed = renewed.solved(initial, again)
+    changed = replace(lasting, division=TiledDrive.renewed).solved(initial, again)
     used = found.solution.used | changed.solution.used
     return found if log_density(found, used) > log_density(changed, used) + CLEAR else changed
 
@@ -120,26 +121,32 @@ class StagedDrive:
     ----------
     drive, prior, options
         As of ``map_drive``.
-    divided
-        Divides the drive into tiles.
+    division
+        Divides the drive into tiles of a prior.
     """
 
     drive: Drive
     prior: FieldPrior
     options: SlamOptions
-    divided: Divided
+    division: Callable[..., TiledDrive]
 
     def solved(self, initial: list[gtsam.Pose3], progress: Progress) -> FieldSolution:
         """Return the solution from key poses by odometry and scans."""
         poses, sensors = self.followed(initial, progress), self.drive.sensors
-        for number, (scale, mu, close) in enumerate(STAGES):
-            progress("solving poses and field", number / len(STAGES))
-            problem = TiledProblem(self.drive, self.divided, self.options, close=close)
+        last_divided = partial(self.division, prior=larger(self.prior))
+        for number, (scale, mu, close) in enumerate(STAGES, start=1):
+            progress("solving poses and field", (number - 1) / len(STAGES))
+            divided = last_divided if number == len(STAGES) else self._divided
+            problem = TiledProblem(self.drive, divided, self.options, close=close)
             last = problem.solved(poses, sensors, scale, mu)
             poses, sensors = last.poses, last.sensors
         found = problem.finished(last)
         progress("solving poses and field", 1.0)
         return found
+
+    @property
+    def _divided(self) -> Divided:
+        return partial(self.division, prior=self.prior)
 
     def followed(self, initial: list[gtsam.Pose3], progress: Progress) -> list[gtsam.Pose3]:
         """Return the poses solved piece by piece, coarsely."""
@@ -164,7 +171,7 @@ class StagedDrive:
         solved from both with less of it, and that one is returned whose solution is likelier then.
         If both solutions are in one place there is nothing to choose.
         """
-        problem = TiledProblem(search.drive, self.divided, self.options, close=CLOSE)
+        problem = TiledProblem(search.drive, self._divided, self.options, close=CLOSE)
         found = problem.solved(poses, search.drive.sensors, *FOLLOWED)
         if (start := search.likeliest(poses)) is poses:
             return found

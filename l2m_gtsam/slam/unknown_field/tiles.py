@@ -60,6 +60,11 @@ def coarser(prior: FieldPrior, modes: int) -> FieldPrior:
     return replace(prior, resolution=prior.resolution.within(modes, prior.options.edge))
 
 
+def larger(prior: FieldPrior) -> FieldPrior:
+    """Return the prior of the larger tiles of the last stage, with waves as short as before."""
+    return replace(prior, options=prior.options.last)
+
+
 def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> FieldPrior:
     """Learn the prior from readings at known places.
 

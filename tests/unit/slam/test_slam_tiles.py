@@ -19,6 +19,7 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     anchor_tiles,
     drive_prior,
     field_prior,
+    larger,
 )
 from tests.drives.slam import calibrated, laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
@@ -174,3 +175,16 @@ def test_a_side_too_weak_for_any_wave_is_left_out() -> None:
     tile = WaveTile.about(weak, np.eye(3), places(3))
     assert len(tile) == len(WaveTile.about(PRIOR, np.eye(3), places(3)).basis.families[1]) + 3
     assert tile.features(places(4)).shape == (200, 3, len(tile))
+
+
+def test_larger_tiles_at_last_have_waves_as_short() -> None:
+    options = TileOptions(core=3.0, modes=200, last_core=5.0)
+    assert (options.last.core, options.last.edge) == (5.0, 6.5)
+    assert options.last.modes == round(200 * (6.5 / 4.5) ** 2)
+    assert TileOptions(core=6.0).last == TileOptions(core=6.0)  # never smaller
+    prior = FieldPrior(Hyperparameters(), Resolution(4.0, 3.0), options)
+    ahead = larger(prior)
+    assert ahead.resolution == prior.resolution
+    # As many for each square metre of the box; a count of waves on a lattice, not its area.
+    few, many = (len(WaveTile.about(each, np.eye(3), places(1))) for each in (prior, ahead))
+    assert many / few == pytest.approx((6.5 / 4.5) ** 2, rel=0.1)

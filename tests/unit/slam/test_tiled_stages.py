@@ -1,7 +1,6 @@
 """A drive in tiles: whether fields last, and which of two places it comes back to."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 from types import SimpleNamespace
 
 import gtsam
@@ -113,7 +112,7 @@ def two_places(monkeypatch: pytest.MonkeyPatch) -> TwoPlaces:
 
     monkeypatch.setattr(TiledProblem, "solved", as_they_are)
     monkeypatch.setattr(ReturnSearch, "density", density)
-    staged = StagedDrive(drive, prior, QUICK, partial(TiledDrive.lasting, prior=prior))
+    staged = StagedDrive(drive, prior, QUICK, TiledDrive.lasting)
     return TwoPlaces(staged, monkeypatch)
 
 
