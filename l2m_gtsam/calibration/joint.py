@@ -130,11 +130,12 @@ class SensorSolution:
         covariance = self.joint_covariance + np.where(np.outer(known, known), added, 0.0)
         own = [] if self.shared_root is None else [self.shared_root]
         part = self.variances.get(cause, np.zeros(3)) + by_block(np.diag(added))
+        variances = {**self.variances, cause: part} if self.variances else {}
         return replace(
             self,
             joint_covariance=covariance,
             shared_root=np.hstack([*own, root[:-1]]) if own else None,
-            variances={**self.variances, cause: part},
+            variances=variances,
         )
 
     def with_spread_of_H(self, spread: FloatArray) -> "SensorSolution":

@@ -50,6 +50,9 @@ class StartSearchOptions(Options):
     the recorded drives true places leave 0.2 to 1.7, a false one 2.2."""
 
 
+MOST_WAVES = 1000  # of a tile: what takes a matrix of 8 MB
+
+
 class TileOptions(Options):
     """The tiles that an unknown field is described by; lengths in metres."""
 
@@ -58,11 +61,11 @@ class TileOptions(Options):
     along both axes of that pose."""
     margin: float = Field(default=0.75, gt=0, le=5)
     """The box of a tile's waves reaches so far beyond its core."""
-    modes: int = Field(default=200, ge=30, le=1000)
+    modes: int = Field(default=200, ge=30, le=MOST_WAVES)
     """The most waves of a tile. What shorter ones would hold counts as noise."""
     last_core: float = Field(default=5.0, gt=0.5, le=20)
-    """Size of tiles in the last stage off line, if it is larger than `core`, with as many more
-    waves: larger tiles connect more of the path, where it is known well enough for them."""
+    """Size of tiles in the last stage off line, if it is larger than `core`, with waves as
+    short, up to 1000: larger tiles connect more of the path, where it is known well enough for them."""
     learn_over_m: float = Field(default=20.0, gt=0)
     """Path length from the start over which strength and depth of the sources are learnt: over it
     odometry has to be better than the field's detail."""
@@ -76,10 +79,8 @@ class TileOptions(Options):
 
     @property
     def last(self) -> "TileOptions":
-        """Tiles of the last stage off line: waves as short as in others, over larger boxes."""
-        larger = self.model_copy(update={"core": max(self.core, self.last_core)})
-        waves = round(self.modes * (larger.edge / self.edge) ** 2)
-        return larger.model_copy(update={"modes": waves})
+        """Tiles of the last stage off line: never smaller than the others."""
+        return self.model_copy(update={"core": max(self.core, self.last_core)})
 
 
 class WholeFieldOptions(Options):

@@ -84,7 +84,8 @@ def _exact(result: CalibrationResult) -> list[Reason]:
         reasons.append(Reason(Level.PASS, text))
     if size := result.unseen_warp_m:
         text = (
-            f"A bend of the drive's frame by {1e3 * size:.1f} mm would not be seen; sigmas hold it."
+            f"Readings leave it open whether the drive's frame is bent by {1e3 * size:.1f} mm; "
+            "sigmas hold it."
         )
         reasons.append(Reason(Level.PASS, text))
     if result.exact:

@@ -24,7 +24,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
 from l2m_gtsam.maps.training import cubes_of, merged, training_set
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
-from l2m_gtsam.slam.options import TileOptions
+from l2m_gtsam.slam.options import MOST_WAVES, TileOptions
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 
 # Widening of the waves' prior: steel is not spread evenly, and with the prior as learnt a stretch
@@ -61,8 +61,13 @@ def coarser(prior: FieldPrior, modes: int) -> FieldPrior:
 
 
 def larger(prior: FieldPrior) -> FieldPrior:
-    """Return the prior of the larger tiles of the last stage, with waves as short as before."""
-    return replace(prior, options=prior.options.last)
+    """Return the prior of the larger tiles of the last stage, with waves as short as before.
+
+    Where these are too many for a tile, the shortest are left out.
+    """
+    options = prior.options.last
+    kept = prior.resolution.within(MOST_WAVES, options.edge)
+    return replace(prior, options=options, resolution=kept)
 
 
 def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> FieldPrior:

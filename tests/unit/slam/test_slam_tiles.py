@@ -11,7 +11,7 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.slam.localisation import prepared
-from l2m_gtsam.slam.options import SlamOptions, TileOptions
+from l2m_gtsam.slam.options import MOST_WAVES, SlamOptions, TileOptions
 from l2m_gtsam.slam.unknown_field.tiles import (
     Anchoring,
     FieldPrior,
@@ -180,7 +180,6 @@ def test_a_side_too_weak_for_any_wave_is_left_out() -> None:
 def test_larger_tiles_at_last_have_waves_as_short() -> None:
     options = TileOptions(core=3.0, modes=200, last_core=5.0)
     assert (options.last.core, options.last.edge) == (5.0, 6.5)
-    assert options.last.modes == round(200 * (6.5 / 4.5) ** 2)
     assert TileOptions(core=6.0).last == TileOptions(core=6.0)  # never smaller
     prior = FieldPrior(Hyperparameters(), Resolution(4.0, 3.0), options)
     ahead = larger(prior)
@@ -188,3 +187,10 @@ def test_larger_tiles_at_last_have_waves_as_short() -> None:
     # As many for each square metre of the box; a count of waves on a lattice, not its area.
     few, many = (len(WaveTile.about(each, np.eye(3), places(1))) for each in (prior, ahead))
     assert many / few == pytest.approx((6.5 / 4.5) ** 2, rel=0.1)
+
+
+def test_the_largest_tiles_have_no_more_waves_than_any_may_have() -> None:
+    wide = TileOptions(modes=1000, last_core=20.0)
+    ahead = larger(FieldPrior(Hyperparameters(), Resolution(8.0, 8.0), wide))
+    assert ahead.resolution.floor < 8.0
+    assert len(WaveTile.about(ahead, np.eye(3), places(1))) < 1.1 * MOST_WAVES  # as above

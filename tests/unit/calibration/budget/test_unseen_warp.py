@@ -69,7 +69,7 @@ def test_moments_are_those_of_all_sizes_one_by_one() -> None:
         moments += each * (covariance + np.outer(mean, mean))
         squares += each * size**2
     slow = known.influence @ (moments / weight) @ known.influence.T
-    # Steps of a grid of a hundred sizes are 6 % each: an integral of smooth functions by them is
+    # Steps of the grid of sizes are 7 % each: an integral of smooth functions by them is
     # good to a thousandth; what is smaller or larger than the grid has less than that.
     np.testing.assert_allclose(found.root @ found.root.T, slow, rtol=5e-3)
     assert found.size_m == pytest.approx(np.sqrt(squares / weight), rel=5e-3)
