@@ -65,7 +65,8 @@ class TileOptions(Options):
     """The most waves of a tile. What shorter ones would hold counts as noise."""
     last_core: float = Field(default=5.0, gt=0.5, le=20)
     """Size of tiles in the last stage off line, if it is larger than `core`, with waves as
-    short, up to 1000: larger tiles connect more of the path, where it is known well enough for them."""
+    short, up to 1000: larger tiles connect more of the path, where it is known well enough for
+    them."""
     learn_over_m: float = Field(default=20.0, gt=0)
     """Path length from the start over which strength and depth of the sources are learnt: over it
     odometry has to be better than the field's detail."""
