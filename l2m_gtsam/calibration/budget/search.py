@@ -108,9 +108,7 @@ class ProcessInformation:
     @property
     def influence(self) -> FloatArray:
         """By how much a unit of each weight is off all variables of the graph, shape (n, M)."""
-        joint = self.joint
-        loose = joint.loose @ (joint.loose.T @ self.across)
-        return np.asarray(loose - joint.every.times(self.across))
+        return self._moved(self.across)
 
     def searched(self, found: Sequence[FoundProcess], noise: float) -> Searched:
         """Return processes with the weights that are most likely beside so much of the noise."""
@@ -122,10 +120,14 @@ class ProcessInformation:
         # Weights take degrees of freedom; white squares are as many as there were.
         noise *= self.squares / (self.squares - float(fit.share.sum()))
         pull = self.across[:, at] @ (root * white)
-        moved = self.joint.loose @ (self.joint.loose.T @ pull)
-        moved -= self.joint.every.times(pull[:, None])[:, 0]
+        moved = self._moved(pull[:, None])[:, 0]
         ends = np.cumsum([len(each) for each in own])[:-1]
         return Searched(tuple(found), noise, tuple(np.split(white, ends)), moved)
+
+    def _moved(self, pull: FloatArray) -> FloatArray:
+        """Return where pulls, shape (n, k), take all variables, in the system itself."""
+        loose = self.joint.loose
+        return np.asarray(loose @ (loose.T @ pull) - self.joint.every.times(pull))
 
 
 def process_information(
