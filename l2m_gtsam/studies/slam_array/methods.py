@@ -7,16 +7,18 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import FloatArray, IntArray, Trajectory
+from l2m_gtsam.data import FloatArray, IntArray, Recording, Trajectory
 from l2m_gtsam.options import Options
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.slam.exploration import explore
-from l2m_gtsam.slam.localisation import localise
+from l2m_gtsam.slam.localisation import localise, prepared
 from l2m_gtsam.slam.online.session import OnlineSlam
+from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.measured import measured
+from l2m_gtsam.studies.peers.exact_loops import closed_by_exact_loops
 from l2m_gtsam.studies.peers.map_particles import MapParticlesOptions, map_particles
-from l2m_gtsam.studies.slam.methods import MethodRow, followed
+from l2m_gtsam.studies.slam.methods import MethodRow, followed, rms
 from l2m_gtsam.studies.slam.recordings import parts_of
 from l2m_gtsam.studies.slam_array.places import PLACES, Drift, DriveInMap, strengths
 
@@ -25,6 +27,7 @@ RECORDINGS = (
     "array-6",
 )
 APART_M = 0.1  # path between the steps of the particle filter
+NEAR_M, WIDE_M = 0.3, 0.6  # reach of loops without errors
 
 
 class SlamArrayOptions(Options):
@@ -58,6 +61,8 @@ class SlamArrayCell:
         In the map: a particle filter on the field's strength, ``l2m slam`` on line and off line.
     online, ours
         Without a map: ``l2m slam`` on line and off line.
+    near_loops_m, wide_loops_m
+        Error that is left where loops of ``NEAR_M`` and ``WIDE_M`` are known without errors.
     """
 
     path_m: float
@@ -68,6 +73,8 @@ class SlamArrayCell:
     map_ours: MethodRow
     online: MethodRow
     ours: MethodRow
+    near_loops_m: float
+    wide_loops_m: float
 
 
 def cell_keys(options: SlamArrayOptions) -> tuple[str, ...]:
@@ -115,7 +122,20 @@ def computed(options: SlamArrayOptions, key: str, drive: DriveInMap) -> SlamArra
             truth,
             unchanged=not is_gained(explored.result),
         ),
+        near_loops_m=loops_rms(drive, recording, chosen, NEAR_M),
+        wide_loops_m=loops_rms(drive, recording, chosen, WIDE_M),
     )
+
+
+def loops_rms(
+    place: DriveInMap, recording: Recording, options: SlamOptions, within_m: float
+) -> float:
+    """Return the error of odometry with all loops so near as they truly are, metres."""
+    drive, _ = prepared(recording, place.calibration, options)
+    drive = drive.as_recorded(drive.jumps)  # the recordings have no slips
+    truth = place.truth[np.searchsorted(place.truth.stamp_ns, drive.stamp_ns)]
+    closed = closed_by_exact_loops(drive, truth, within_m)
+    return rms(np.stack([pose.translation() for pose in closed]), truth.p)
 
 
 def is_gained(result: LocalisationResult) -> bool:

@@ -1,15 +1,17 @@
 """The study of SLAM with several sensors: ``l2m study slam-array``."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from l2m_gtsam.studies.slam.methods import site_of
+from l2m_gtsam.studies.slam.methods import MethodRow, site_of
 from l2m_gtsam.studies.slam.study import WIDTH, MethodFigures, draw_bars, figures_of
 from l2m_gtsam.studies.slam_array.methods import (
+    NEAR_M,
+    WIDE_M,
     SlamArrayCell,
     SlamArrayOptions,
     cell_keys,
@@ -40,6 +42,28 @@ SIMULATED = {"warehouse", "corridor"}
 
 
 @dataclass(frozen=True)
+class DriftLeft:
+    """What loops without errors leave of the drift.
+
+    Attributes
+    ----------
+    rms_m
+        Mean error of the seeds.
+    removed
+        Share of the drift that is removed, of the means.
+    """
+
+    rms_m: float
+    removed: float
+
+    @classmethod
+    def of(cls, rms_m: Sequence[float], before: Sequence[MethodRow]) -> "DriftLeft":
+        """Return it over all seeds, by what is left in each and odometry alone."""
+        mean = float(np.mean(rms_m))
+        return cls(mean, 1 - mean / float(np.mean([each.rms_m for each in before])))
+
+
+@dataclass(frozen=True)
 class SlamArrayRow:
     """A recording with one kind of drift."""
 
@@ -53,6 +77,8 @@ class SlamArrayRow:
     map_ours: MethodFigures
     online: MethodFigures
     ours: MethodFigures
+    near_loops: DriftLeft
+    wide_loops: DriftLeft
 
 
 @dataclass(frozen=True)
@@ -104,6 +130,8 @@ class SlamArrayStudy(Study[SlamArrayOptions, SlamArrayCell, SlamArraySummary]):
         kinds = {row.site.split()[0] for row in summary.rows}
         return {
             "methods": METHODS,
+            "near_m": NEAR_M,
+            "wide_m": WIDE_M,
             "kinds": kinds,
             "ours": kinds & SIMULATED,
             "worse": [
@@ -156,6 +184,8 @@ def row_of(key: str, cells: list[SlamArrayCell]) -> SlamArrayRow:
         map_ours=figures_of([each.map_ours for each in cells], before),
         online=figures_of([each.online for each in cells], before),
         ours=figures_of([each.ours for each in cells], before),
+        near_loops=DriftLeft.of([each.near_loops_m for each in cells], before),
+        wide_loops=DriftLeft.of([each.wide_loops_m for each in cells], before),
     )
 
 

@@ -34,6 +34,8 @@ def test_what_is_lost_is_on_the_page() -> None:
             map_ours=good,
             online=good,
             ours=kept if "walk" in key else good,
+            near_loops_m=0.25,
+            wide_loops_m=0.05,
         )
         for key in keys
     }
@@ -43,6 +45,7 @@ def test_what_is_lost_is_on_the_page() -> None:
     assert "worse than its odometry: robot 1, slip (map: particle filter)." in page
     assert "no gain is shown: robot 1, walk (2); array 6, walk (2) seeds." in page
     assert "| robot 1 | 3, 30 m | slip | 200 | 160 | 20 | 20 | 20 | 20 | 90 % | 90 % |" in page
+    assert "| robot 1 | walk | 250, -25 % | 50, 75 % | 200, 0 % |" in page
     assert "*Robot* is" in page
     assert "we simulate" not in page
     assert set(SLAM_ARRAY.figures(summary)) == {"slam-array"}
