@@ -1,5 +1,7 @@
 """Loops without errors: which places they link, and what they leave of a drift."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.peers.exact_loops import AWAY_M, closed_by_exact_loops, exact_loops
 from l2m_gtsam.studies.slam.methods import given_sensors, rms
+from l2m_gtsam.studies.slam_array.odometry import walked
 from tests.drives.slam import laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -18,14 +21,15 @@ NEAR_M = 0.4
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[Drive, Trajectory]:
-    """Two laps of 21 m by odometry that slips, and the true poses."""
+    """Two laps of 21 m by odometry that walks at random, and the true poses."""
     rng = np.random.default_rng(0)
     sensors = random_sensors(1, 1)
     recorded = slam_drive(dipole_world(1), sensors, laps(70), rng)
     options = SlamOptions.model_validate(
         {"key_poses": {"distance_m": 0.5}, "drift": {"steady": 0.0}}
     )
-    found, _ = prepared(recorded.recording, given_sensors(sensors, 0.2), options)
+    walking = replace(recorded.recording, trajectory=walked(recorded.truth, rng))
+    found, _ = prepared(walking, given_sensors(sensors, 0.2), options)
     rows = np.searchsorted(recorded.truth.stamp_ns, found.stamp_ns)
     return found, recorded.truth[rows]
 
@@ -60,7 +64,8 @@ def test_a_place_that_is_seen_again_is_where_it_was(drive: tuple[Drive, Trajecto
         rms(np.stack([pose.translation() for pose in each]), truth.p)
         for each in (poses, driven.dead_reckoning())
     )
-    assert 0.02 < left < 0.7 * before
+    # The drift of the first lap is left, many times the millimetre that the links are known to.
+    assert 0.01 < left < 0.7 * before
 
 
 def test_without_a_place_that_is_near_odometry_stays(drive: tuple[Drive, Trajectory]) -> None:
