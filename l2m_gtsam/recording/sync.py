@@ -274,5 +274,5 @@ def _nothing_left(recording: Recording, options: SyncOptions, largest_offset_s: 
     return (
         f"{recording.source.path}: no finite reading has a pose: readings run from {span}, poses "
         f"from {poses}, and poses may be {options.max_pose_gap_s:g} s apart at most{around} "
-        "(`sync.max_pose_gap_s`); if their clocks differ, try `bag.stamps: record`"
+        "(`max_pose_gap_s`); if their clocks differ, try `bag.stamps: record`"
     )
