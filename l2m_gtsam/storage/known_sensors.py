@@ -1,7 +1,8 @@
 """Files of sensors whose place and distortion are known, and how well they are known."""
 
 import warnings
-from dataclasses import replace
+from dataclasses import fields, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
 
@@ -10,13 +11,15 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator,
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Matrix, Vector
 from l2m_gtsam.errors import CalibrationError, Notice
-from l2m_gtsam.records.calibration import SensorStatus, TimeOffset
+from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus, TimeOffset
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.yaml_file import checked, read_yaml, write_yaml
 
 SIZE, TAU = 16, 15  # (t, C row by row, H, time offset); the last is the offset
 SHAPES = {"t_sigma": (3,), "C_sigma": (3, 3), "H_sigma": (3,)}
 ROUNDING = 1e-6  # of a variance, of numbers written with few digits
+FARTHEST_M = 100.0  # of a sensor from the lidar: beyond it, its place is written in millimetres
+LIKE = 0.75  # of ``difflib``: a key so like one that is known is a misspelt one
 # What a calibration leaves open is anywhere within these sigmas: metres, 1, uT, seconds.
 OPEN = np.repeat([1.0, 1.0, 100.0, 0.1], [3, 9, 3, 1])
 
@@ -158,6 +161,21 @@ class _Known(_Finite):
     H: Vector = Field(default_factory=lambda: np.zeros(3))
     time_offset: _Clock | None = None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _well_spelt(cls, entry: Any) -> Any:
+        for key in map(str, entry) if isinstance(entry, dict) else ():
+            if key not in KEYS and (meant := _meant(key)):
+                raise ValueError(f"unknown key {key}; is {meant} meant?")
+        return entry
+
+    @field_validator("t_lidar_mag")
+    @classmethod
+    def _near(cls, t: Vector) -> Vector:
+        if (away := float(np.linalg.norm(t))) > FARTHEST_M:
+            raise ValueError(f"the sensor is {away:g} m from the LiDAR; positions are in metres")
+        return t
+
     @field_validator("C")
     @classmethod
     def _invertible(cls, C: Matrix) -> Matrix:
@@ -213,6 +231,18 @@ class ListedSensor(_Known):
         if self.time_offset is None:
             return None
         return TimeOffset(self.time_offset.seconds, float("inf"), np.zeros(15), "it is listed")
+
+
+# Of an entry, in a list by hand or in the file of a calibration.
+KEYS = {*ListedSensor.model_fields, *StatedErrors.model_fields}
+KEYS |= {each.name for each in fields(SensorCalibration)}
+
+
+def _meant(key: str) -> str | None:
+    """Return the key that a misspelt one is like; None if it is none of these."""
+    by_lower = {each.lower(): each for each in sorted(KEYS)}
+    near = get_close_matches(key.lower(), by_lower, 1, LIKE)
+    return by_lower[near[0]] if near else None
 
 
 class _KnownFile(_Finite):

@@ -17,9 +17,9 @@ of the sensors' differences, and of H as it shows under several headings.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cholesky, null_space
+from scipy.linalg import null_space
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.error_modes import TileModes, moved_weights
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.tiles import Tiles
@@ -34,6 +34,7 @@ PARTS = np.repeat(np.arange(len(NAMES)), [3, 9, 3, 1])
 H = NAMES.index("H")
 JUDGED = (NAMES.index("C"), NAMES.index("H"))
 SMALLEST = 0.01  # of what was stated
+NOTHING = 1e-9  # of a variance: what rounding leaves of none
 LEAST_GAIN = 16.0  # twice a logarithm of likelihood; chance gives four sizes that in 0.1 % of maps
 
 
@@ -104,7 +105,7 @@ def suite_sizes(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> SuiteSizes 
     return SuiteSizes(*np.sqrt(found.sizes).tolist())
 
 
-def stated_size(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> StatedSize:
+def stated_size(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> StatedSize | None:
     """Return how large errors of C and H are beside what was stated of them, all alike.
 
     Places of sensors are not judged: millimetres hardly show, and waves that a map misses between
@@ -118,12 +119,11 @@ def stated_size(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> StatedSize:
     turned, part = differences(len(suite.sensors))
     known = np.einsum("ij,ij->j", turned, suite.covariance @ turned) > 0
     turned, part = turned[:, known], part[known]
-    # Independent numbers of unit variance as stated. Those of C and H come last, so that places
-    # and clocks, which they may hang together with, stay as they are stated.
-    order = np.argsort(np.isin(part, JUDGED), kind="stable")
-    turned, judged = turned[:, order], np.isin(part[order], JUDGED)
-    root = cholesky(turned.T @ suite.covariance @ turned, lower=True)
-    view = survey_view(learnt, tiles, suite, turned @ root)
+    stated = stated_modes(turned.T @ suite.covariance @ turned, np.isin(part, JUDGED))
+    judged = stated.judged
+    if not judged.any():
+        return None
+    view = survey_view(learnt, tiles, suite, turned @ stated.root)
     system = view.system.beside((~judged).astype(float)).among(np.flatnonzero(judged))
     alike = np.ones((1, int(judged.sum())))
     found = system.components_and_noise(alike, view.squares)
@@ -131,10 +131,56 @@ def stated_size(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> StatedSize:
     return StatedSize(ErrorCause.SUITE, max(float(np.sqrt(found.sizes[0])), SMALLEST), gain)
 
 
+@dataclass(frozen=True)
+class StatedModes:
+    """Independent numbers of unit variance that make the errors that were stated.
+
+    Attributes
+    ----------
+    root
+        The k errors by the r numbers, shape (k, r).
+    judged
+        Which of these move the errors that are judged alone, shape (r,).
+    """
+
+    root: FloatArray
+    judged: BoolArray
+
+
+def stated_modes(covariance: FloatArray, judged: BoolArray) -> StatedModes:
+    """Return what errors of a covariance, (k, k), are made of, those that are judged last.
+
+    Numbers that places and clocks hang on come first: with them C and H move as far as they are
+    stated to hang together. The covariance is singular where some sensors are exact.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sigma, sigma)
+    others = np.flatnonzero(~judged)
+    first = determined_root(correlation[np.ix_(others, others)])
+    # The regression of all errors on these numbers: P_ka L (L^T L)^-1 with P_aa = L L^T.
+    carried = correlation[:, others] @ first / np.sum(first**2, axis=0)
+    left = correlation - carried @ carried.T
+    last = np.flatnonzero(judged)
+    own = np.zeros((len(judged), 0))
+    if len(last):
+        rest = determined_root(left[np.ix_(last, last)])
+        own = np.zeros((len(judged), rest.shape[1]))
+        own[last] = rest
+    root = sigma[:, None] * np.hstack([carried, own])
+    return StatedModes(root, np.arange(root.shape[1]) >= carried.shape[1])
+
+
+def determined_root(correlation: FloatArray) -> FloatArray:
+    """Return L of full column rank with ``L L^T`` a matrix of correlations, (n, n), orthogonal."""
+    values, vectors = np.linalg.eigh(correlation)
+    kept = values > NOTHING
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+
+
 def stated_doubts(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> tuple[str, ...]:
     """Return what is wrong with sigmas that were stated of a survey's sensors, a sentence."""
     found = stated_size(learnt, tiles, suite)
-    if not found.is_wrong or (found.ratio < 1 and suite.calibrated_together):
+    if found is None or not found.is_wrong or (found.ratio < 1 and suite.calibrated_together):
         return ()
     wrong = "too small" if found.ratio > 1 else "too large"
     return (

@@ -64,6 +64,9 @@ def test_what_a_calibration_left_open_is_open(tmp_path: Path) -> None:
         ({"covariance": (np.eye(15) + np.eye(15, k=1)).tolist()}, "covariance"),
         ({"covariance": (np.eye(15) - 0.9 * np.ones((15, 15))).tolist()}, "covariance"),
         ({"covariance": np.full((15, 15), np.nan).tolist()}, "covariance"),
+        ({"t_sgima": 0.003}, "unknown key t_sgima; is t_sigma meant"),
+        ({"h": [1.0, 2.0, 3.0]}, "unknown key h; is H meant"),
+        ({"t_lidar_mag": [0.0, -300.0, 500.0]}, "583.095 m from the LiDAR; .* in metres"),
         ({"common": np.ones((16, 2)).tolist()}, "common"),
         ({"covariance": np.eye(15).tolist(), "common": [[1.0]]}, "common"),
         ({"covariance": np.eye(15).tolist(), "common": np.ones((16, 1)).tolist()}, "common"),
@@ -76,6 +79,10 @@ def test_impossible_errors_are_refused_in_one_line(
         read(tmp_path, **entry)
     assert "\n" not in str(refused.value)
     assert "mag" in str(refused.value)
+
+
+def test_what_is_noted_beside_is_no_misspelt_key(tmp_path: Path) -> None:
+    assert read(tmp_path, R_lidar_mag=np.eye(3).tolist(), serial="A7", bought="2024-05-01") is None
 
 
 def test_a_suite_of_which_nothing_is_solved_says_so(tmp_path: Path) -> None:
