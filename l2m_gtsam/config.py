@@ -10,7 +10,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.lidar.options import PointCloudOptions
 from l2m_gtsam.mapping.options import MappingOptions
-from l2m_gtsam.options import Options, words_of
+from l2m_gtsam.options import Options, named_fault, words_of
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.qa.options import FleetOptions, QaOptions
 from l2m_gtsam.records.calibration import Uncertainty
@@ -122,7 +122,7 @@ def with_poses(
 
 def _explain(path: Path, error: ValidationError, model: type[BaseModel]) -> str:
     """Return one line about the first fault."""
-    fault = error.errors()[0]
+    fault = named_fault(error)
     key = shown(".".join(str(part) for part in fault["loc"]), LONGEST_KEY) or "the file"
     if fault["type"] == "extra_forbidden":
         accepted = ", ".join(_accepted(model, fault["loc"][:-1]))

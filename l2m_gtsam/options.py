@@ -69,6 +69,13 @@ def _docstrings(model: type[BaseModel]) -> dict[str, str]:
     }
 
 
+def named_fault(error: ValidationError) -> ErrorDetails:
+    """Return the first fault; an unknown key before what is missing in its place."""
+    faults = error.errors()
+    unknown = (fault for fault in faults if fault["type"] == "extra_forbidden")
+    return next(unknown, faults[0]) if faults[0]["type"] == "missing" else faults[0]
+
+
 def first_fault(error: ValidationError, *above: str, hidden: Collection[str] = ()) -> str:
     """Return the first fault as the path of its key, and what is wrong with it.
 
@@ -81,7 +88,7 @@ def first_fault(error: ValidationError, *above: str, hidden: Collection[str] = (
     hidden
         Levels that a file does not have.
     """
-    fault = error.errors()[0]
+    fault = named_fault(error)
     keys = (*above, *(str(part) for part in fault["loc"] if part not in hidden))
     return f"{'.'.join(keys) or 'the file'}: {words_of(fault)}"
 

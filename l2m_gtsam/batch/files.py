@@ -35,7 +35,7 @@ def check_outputs(*files: Path, suffix: str | None = None) -> None:
         if file.exists() and not file.is_file():
             raise OutputError(f"{file}: exists and is not a regular file; choose another --out")
         if file.parent.exists() and not file.parent.is_dir():
-            raise OutputError(f"{file.parent}: is a file, --out needs a folder; choose another")
+            raise OutputError(f"{file.parent}: is a file; a folder is needed there")
 
 
 def ensure_folder(folder: Path) -> None:

@@ -16,8 +16,8 @@ class MotionOptions(Options):
     """Which extra motions are tried."""
 
     poses: int = Field(default=100, ge=10)
-    """The most poses of each motion; every sensor reads once at each. A motion along the path of a
-    drive has no more than the drive."""
+    """Poses of a turn on the spot and of a loop; every sensor reads once at each. A motion along
+    the path of a drive has those of the drive."""
     heave_m: float = Field(default=0.2, gt=0)
     """Up and down by so much."""
     tilt_deg: float = Field(default=5.0, gt=0, lt=45)
@@ -80,19 +80,17 @@ def extra_motions(drive: ExtraMotion, options: MotionOptions) -> tuple[ExtraMoti
     Parameters
     ----------
     drive
-        The drive, its times ascending.
+        The drive as a sensor reads on it, its times ascending, none twice.
     options
         How much of each.
     """
-    # No pose twice: the vehicle has no velocity between a pose and itself.
-    rows = np.unique(np.linspace(0, len(drive.p) - 1, options.poses).round().astype(int))
-    R, p, seconds = drive.R[rows], drive.p[rows], drive.seconds[rows]
-    swings = min(SWINGS, len(rows) / 4)
-    swing = np.sin(2 * np.pi * swings * np.linspace(0, 1, len(rows)))
+    R, p, seconds = drive.R, drive.p, drive.seconds
+    swings = min(SWINGS, len(p) / 4)
+    swing = np.sin(2 * np.pi * swings * np.linspace(0, 1, len(p)))
     up = np.array([0.0, 0.0, 1.0])
-    tilt, round_ = np.deg2rad(options.tilt_deg) * swing, np.linspace(0, 2 * np.pi, len(swing))
+    tilt, round_ = np.deg2rad(options.tilt_deg) * swing, np.linspace(0, 2 * np.pi, options.poses)
     middle = len(p) // 2
-    spot = np.broadcast_to(p[middle], p.shape)
+    spot = np.broadcast_to(p[middle], (options.poses, 3))
     return (
         ExtraMotion("the same drive once more", R, p, seconds),
         ExtraMotion(

@@ -134,7 +134,7 @@ def plan(
     least = max(range(len(sensors)), key=lambda index: worsts[index].badness)
     # The other sensors are known better: what a motion does for them need not be asked.
     one, alone = task.of(least), only(readings, least)
-    motions = _with_motions(one, alone, _motions(readings, solver_map, planning), progress)
+    motions = _with_motions(one, alone, _motions(alone, solver_map, planning), progress)
     return DrivePlan(
         sensors=sensors,
         noise=noise,
@@ -230,8 +230,8 @@ def _places(sensors: tuple[str, ...], options: CalibrationOptions, priors: Prior
 def _motions(
     readings: Readings, field_map: QueryableMap, planning: PlanOptions
 ) -> tuple[ExtraMotion, ...]:
-    """Return the motions to try on a drive."""
-    # Sensors that share their stamps share their poses: each counts once.
+    """Return the motions to try on a drive, by the readings of one sensor."""
+    # No pose twice: the vehicle has no velocity between a pose and itself.
     stamps, first = np.unique(readings.stamp_ns, return_index=True)
     seconds = (stamps - stamps[0]) / NANOSECONDS
     drive = ExtraMotion("drive", readings.R_map_lidar[first], readings.p_map_lidar[first], seconds)

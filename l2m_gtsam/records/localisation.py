@@ -229,9 +229,9 @@ class Gain(Record):
         """The figures as a clause."""
         change = "likelier" if self.likelier > 0 else "less likely"
         return (
-            f"the readings are {change} by exp({abs(self.likelier):.0f}) at poses that they "
-            f"correct by {self.moved_m:.2g} m rms, and odometry is nearer to the truth than these "
-            f"with a probability of {self.doubt:.2g}"
+            f"poses that the readings correct by {self.moved_m:.2g} m rms make the readings "
+            f"{change} by exp({abs(self.likelier):.0f}), but are further from the truth than "
+            f"odometry with a probability of {self.doubt:.2g}"
         )
 
 

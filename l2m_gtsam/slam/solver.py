@@ -285,11 +285,14 @@ class JointPosterior:
     ----------
     covariance
         Joint, shape (n, n).
+    mean
+        From where the graph was linearised, shape (n,).
     decrease
         Of the error from zero to the solution: what a step of Gauss and Newton promises.
     """
 
     covariance: FloatArray
+    mean: FloatArray
     decrease: float
 
 
@@ -302,22 +305,25 @@ def joint_posterior(linear: gtsam.GaussianFactorGraph, keys: Sequence[int]) -> J
     """
     last = ordered(keys)
 
-    def by_cholesky() -> tuple[FloatArray, float]:
+    def by_cholesky() -> tuple[FloatArray, FloatArray, float]:
         left = linear.marginal(list(keys))
         left.eliminateMultifrontal(last)
         augmented = left.augmentedHessian(last)
         W = triangular_information_root(augmented[:-1, :-1], 0.0)
         # Its constant is twice the error at the solution for the others, and these at zero.
         white = W @ augmented[:-1, -1]
-        return np.asarray(W.T @ W), float(0.5 * (augmented[-1, -1] - white @ white))
+        least = float(0.5 * (augmented[-1, -1] - white @ white))
+        return np.asarray(W.T @ W), np.asarray(W.T @ white), least
 
-    def by_qr() -> tuple[FloatArray, float]:
+    def by_qr() -> tuple[FloatArray, FloatArray, float]:
         net = linear.marginalMultifrontalBayesNet(last, gtsam.EliminateQR)
-        return net_covariance(net, keys), linear.error(linear.optimize(gtsam.EliminateQR))
+        best = linear.optimize(gtsam.EliminateQR)
+        mean = np.concatenate([best.at(key) for key in keys])
+        return net_covariance(net, keys), mean, linear.error(best)
 
-    covariance, least = unless_indeterminate(by_cholesky) or by_qr()
+    covariance, mean, least = unless_indeterminate(by_cholesky) or by_qr()
     here = linear.error(gtsam.VectorValues.Zero(linear.gradientAtZero()))
-    return JointPosterior(covariance, here - least)
+    return JointPosterior(covariance, mean, here - least)
 
 
 def ordered(keys: Sequence[int]) -> gtsam.Ordering:

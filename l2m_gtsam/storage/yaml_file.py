@@ -117,6 +117,7 @@ class _Representer(SafeRepresenter):
 
 _Representer.add_multi_representer(StrEnum, lambda writer, each: writer.represent_str(each.value))
 
+LONGEST = 100  # characters of what is wrong with a file, of a stranger's own words
 MOST_IN_ROW = 64  # numbers, which take less than a line
 LINE = 4096
 
@@ -183,7 +184,7 @@ def read_yaml(path: Path, error: type[L2MError]) -> Any:
     try:
         text = raw.decode("utf-8")
     except UnicodeDecodeError as reason:
-        raise error(f"{path}: cannot be read as text") from reason
+        raise error(f"{path}: not a text; a YAML file is needed here") from reason
     try:
         return BoundedYAML().load(text)
     except TooMuchYAMLError as reason:
@@ -191,7 +192,8 @@ def read_yaml(path: Path, error: type[L2MError]) -> Any:
     except YAMLError as reason:
         mark = getattr(reason, "problem_mark", None)
         where = "" if mark is None else f", line {mark.line + 1}"
-        why = f": {reason}" if mark is None and not isinstance(reason, MarkedYAMLError) else ""
+        told = reason.problem if isinstance(reason, MarkedYAMLError) else None if mark else reason
+        why = f": {' '.join(str(told).split())[:LONGEST]}" if told else ""
         raise error(f"{path}: not valid YAML{where}{why}") from reason
 
 

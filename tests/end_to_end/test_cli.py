@@ -163,7 +163,7 @@ def test_suite_without_the_sensor(demo: Demo, tmp_path: Path) -> None:
 def test_an_output_that_cannot_be_written(demo: Demo, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     line = complaint_here("calibrate", demo.drive, "--map", demo.map, "--out", tmp_path / "file")
-    assert "is a file, --out needs a folder" in line
+    assert "is a file; a folder is needed there" in line
     assert (tmp_path / "file").read_text() == "in the way"
 
 

@@ -51,7 +51,12 @@ def test_the_effective_configuration_reads_back() -> None:
             "bag: {regressors: {motor: {topic: /m, feild: x}}}",
             r"unknown key 'bag.regressors.motor.feild'; accepted here: field, scale, topic",
         ),
+        (
+            "qa: {position_sigma_m: {wran: 0.003}}",
+            r"unknown key 'qa.position_sigma_m.wran'; accepted here: fail, warn",
+        ),
         ("bag: {fields: [", r"not valid YAML"),
+        ("bag:\n\tfields: []", r"not valid YAML, line 2: found character '\\t'"),
     ],
 )
 def test_faults_are_one_line_that_names_the_key(tmp_path: Path, content: str, pattern: str) -> None:

@@ -54,8 +54,8 @@ def drift_lines(result: LocalisationResult) -> tuple[str, ...]:
     if covariance is not None:
         sigma = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
         known = (
-            f"stated error of the positions: {1e3 * np.median(sigma):.0f} mm in the median, "
-            f"{1e3 * sigma.max():.0f} mm at most"
+            f"stated error of the positions, all three axes together: {1e3 * np.median(sigma):.0f} "
+            f"mm in the median, {1e3 * sigma.max():.0f} mm at most (1 sigma)"
         )
         lines.append(known)
     return tuple(lines)

@@ -210,6 +210,7 @@ def _packed_explorer(explorer: Explorer, facts: dict[str, Any]) -> Arrays:
                 "R": frame.R_map_tile,
                 "heights": np.array([low, low + frame.height]),
                 "past_information": tile.past_information,
+                "returns": np.array([tile.returns], dtype=np.int64),
             },
         )
     return arrays
@@ -247,7 +248,9 @@ def _unpacked_memory(slam: OnlineSlam, arrays: Arrays, field: dict[str, Any]) ->
 def _unpacked_tile(number: int, arrays: Arrays, prior: FieldPrior) -> RememberedTile:
     R = arrays["R"]
     field = WaveTile.about(prior, R, arrays["heights"][:, None] * R[:, 2])
-    return RememberedTile(number, int(arrays["anchor"][0]), field, arrays["past_information"])
+    returns = int(arrays["returns"][0]) if "returns" in arrays else 0  # of older states
+    anchor, past = int(arrays["anchor"][0]), arrays["past_information"]
+    return RememberedTile(number, anchor, field, past, returns)
 
 
 def _packed_intake(state: IntakeState) -> Arrays:

@@ -35,12 +35,15 @@ class RememberedTile:
         Basis of its m weights.
     past_information
         Information about the weights by readings of marginalised poses, shape (m, m).
+    returns
+        How often the vehicle has come back to it.
     """
 
     number: int
     anchor: int
     field: WaveTile
     past_information: FloatArray
+    returns: int = 0
 
     @classmethod
     def new(cls, number: int, anchor: int, field: WaveTile) -> "RememberedTile":

@@ -1,6 +1,6 @@
 """The last stretch of a drive through an unknown field, solved again as it grows."""
 
-from collections.abc import Generator, Iterator, Sequence, Set
+from collections.abc import Generator, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 
 import gtsam
@@ -12,7 +12,13 @@ from l2m_factors import (
 )
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose, part_of, prior_factors
+from l2m_gtsam.slam.joint_gaussian import (
+    JointGaussian,
+    is_pose,
+    part_of,
+    prior_factors,
+    retracted,
+)
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.map_prediction import (
     PlacedReadings,
@@ -110,18 +116,13 @@ class OpenSection:
             numbers = [self._first, *(k for k in numbers if k > self._first)]
         entered = [self._enter(k) for k in numbers]
         for scale in AGAIN if any(entered) else ONWARDS:
-            graph = self._factors(numbers[0], scale)
+            self._counted = self._weighed(numbers[0], scale)
+            graph = self._factors(self._counted)
             yield
             graph.push_back(self._prior_factors())
             yield from self._solved(graph, 1)
-        graph = self._factors(numbers[0], 1.0)
-        yield
-        for each in self._counted:
-            tile = self._tiles[each.laid.number]
-            for factor in each.penalties(tile):
-                graph.add(factor)
-            yield
-        graph.push_back(self._prior_factors())
+        self._counted = self._weighed(numbers[0], 1.0)
+        graph = yield from self._whole(self._counted)
         yield from self._solved(graph, 1)
         yield from self._looked_at(graph)
         if self._promised > CLOSE:
@@ -137,7 +138,7 @@ class OpenSection:
 
     def closed(self) -> Generator[None, None, FieldMemory]:
         """Return the memory updated by the section; yields between pieces of the work."""
-        known = self._memory.known.updated(self._after)
+        known = self._memory.known.updated((yield from self._remembered()))
         yield
         tiles = list(self._tiles)
         for each in self._counted:
@@ -148,6 +149,25 @@ class OpenSection:
         let_go = {X(self._first)} - {X(tile.anchor) for tile in tiles} - {X(self._last)}
         kept = [key for key in known.sizes if key not in let_go]
         return FieldMemory(known.marginal(kept), tuple(tiles))
+
+    def _remembered(self) -> Generator[None, None, JointGaussian]:
+        """Return the section's posterior, of which the memory learns nothing twice.
+
+        What the waves of a tile leave out is the same at each visit: counted anew each time it
+        would average out over laps. The last pose suffers from it once. All else is known as where
+        it counts as often as the vehicle has come back to the tile, so that more visits tell little
+        more, and the last pose follows it as by the readings as they are.
+        """
+        times = {number: max(self._tiles[number].returns, 1) for number in self._tile_of.values()}
+        if max(times.values()) == 1:
+            return self._after
+        graph = yield from self._whole(self._weighed(self._last + 2, 1.0, times))
+        linear, keys = graph.linearize(self._values), self._kept()[:-1]
+        yield
+        found, sizes = joint_posterior(linear, keys), {key: self._size(key) for key in keys}
+        yield
+        values = retracted(part_of(self._values, keys), sizes, found.mean)
+        return self._after.updated(JointGaussian(values, sizes, found.covariance))
 
     def next(self, memory: FieldMemory, first: int) -> "OpenSection":
         """Return a new section from a key pose on."""
@@ -204,8 +224,12 @@ class OpenSection:
             return False
         if self._values.exists(M(number)):
             return False
-        self._share([X(self._tiles[number].anchor), M(number)])
-        return number not in self._tiles_before
+        tile = self._tiles[number]
+        self._share([X(tile.anchor), M(number)])
+        if number in self._tiles_before:
+            return False
+        self._tiles[number] = replace(tile, returns=tile.returns + 1)
+        return True
 
     def _share(self, keys: Sequence[int]) -> None:
         """Take variables of the memory into the section; those of its own stay."""
@@ -232,21 +256,55 @@ class OpenSection:
         own = {int(k): origin.between(self.pose(int(k))) for k in np.unique(readings.key_pose)}
         return place_readings(readings, own, self._sensors)
 
-    def _factors(self, new: int, scale: float) -> gtsam.NonlinearFactorGraph:
-        """Return all but the memory; readings since ``new`` are scaled."""
+    def _weighed(
+        self, new: int, scale: float, times: Mapping[int, int] | None = None
+    ) -> list[TileReadings]:
+        """Return all readings with weights by their tiles' current predictions.
+
+        Parameters
+        ----------
+        new
+            Readings since this key pose are weighed softly,
+        scale
+            and have this multiple of their noise.
+        times
+            How often what a tile's waves leave out counts, by its number; once if not given.
+        """
+        key = self._of_section.readings.key_pose
+        owner = np.array([self._tile_of[int(k)] for k in key], dtype=np.int64)
+        return [
+            self._weighed_in(
+                self._tiles[number],
+                np.flatnonzero(owner == number),
+                new,
+                scale,
+                1 if times is None else times[number],
+            )
+            for number in np.unique(owner).tolist()
+        ]
+
+    def _factors(self, counted: Sequence[TileReadings]) -> gtsam.NonlinearFactorGraph:
+        """Return the factors of all but the memory."""
         graph, old = self._motions(), len(self._memory.tiles)
         for tile in self._tiles[old:]:
             unit = gtsam.noiseModel.Unit.Create(len(tile.field))
             graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
-        key = self._of_section.readings.key_pose
-        owner = np.array([self._tile_of[int(k)] for k in key], dtype=np.int64)
-        self._counted = [
-            self._weighed(self._tiles[number], np.flatnonzero(owner == number), new, scale)
-            for number in np.unique(owner).tolist()
-        ]
-        for tile_readings in self._counted:
-            for factor in tile_readings.factors():
+        for each in counted:
+            for factor in each.factors():
                 graph.add(factor)
+        return graph
+
+    def _whole(
+        self, counted: Sequence[TileReadings]
+    ) -> Generator[None, None, gtsam.NonlinearFactorGraph]:
+        """Return the factors of the last stage, the memory's among them, in pieces of work."""
+        graph = self._factors(counted)
+        yield
+        for each in counted:
+            for factor in each.penalties(self._tiles[each.laid.number]):
+                graph.add(factor)
+            yield
+        graph.push_back(self._prior_factors())
         return graph
 
     def _motions(self) -> gtsam.NonlinearFactorGraph:
@@ -257,10 +315,10 @@ class OpenSection:
             graph.push_back(link_graph(each.links))
         return graph
 
-    def _weighed(
-        self, tile: RememberedTile, rows: IntArray, new: int, scale: float
+    def _weighed_in(
+        self, tile: RememberedTile, rows: IntArray, new: int, scale: float, times: int
     ) -> TileReadings:
-        """Return the readings of a tile with weights by its current prediction."""
+        """Return the readings of a tile; other arguments as of ``_weighed``."""
         sensors, readings = self._sensors, self._of_section.readings
         laid = OccupiedTile(
             tile.number, tile.anchor, rows, tile.field, self._place(rows, tile.anchor)
@@ -273,7 +331,7 @@ class OpenSection:
         noise = sensors.noise[readings.sensor[rows]] * np.where(recent, scale, 1.0)
         mu = np.where(recent, SOFT, np.inf)
         robust = self._options.robust
-        return TileReadings.weighed(self._of_section, laid, prediction, noise, mu, robust)
+        return TileReadings.weighed(self._of_section, laid, prediction, noise, mu, robust, times)
 
     def _prior_factors(self) -> gtsam.NonlinearFactorGraph:
         """Return the memory's factors on the variables that it shares."""

@@ -55,6 +55,7 @@ class TileReadings:
         noise: FloatArray,
         mu: FloatArray,
         robust: RobustOptions,
+        times: int = 1,
     ) -> "TileReadings":
         """Return the robust weights of readings by a tile's prediction.
 
@@ -70,6 +71,8 @@ class TileReadings:
             Convexity of the loss for each reading, see ``solve.robust``, shape (n,).
         robust
             Loss and confidence.
+        times
+            How often what the waves leave out counts.
         """
         W = prediction.whitening_of(noise)
         r2, weights = prediction.squared(W), np.empty(len(mu))
@@ -79,7 +82,7 @@ class TileReadings:
         # A reading is judged by itself; those that count share what the waves leave out.
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         unresolved = np.zeros((len(mu), AXES))
-        unresolved[chosen] = laid.field.unresolved_together(laid.placed.x[chosen])
+        unresolved[chosen] = times * laid.field.unresolved_together(laid.placed.x[chosen])
         variance = noise[:, None] ** 2 + unresolved
         W = prediction.whitening_of(noise, unresolved)[chosen]
         W *= np.sqrt(weights[chosen])[:, None, None]

@@ -11,6 +11,7 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import ExploringOptions
+from l2m_gtsam.slam.unknown_field.field_memory import RememberedTile
 from l2m_gtsam.slam.unknown_field.tiled_stages import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from tests.drives.exploring import OnLine, prepared_drive, rms
@@ -86,6 +87,30 @@ def test_what_is_remembered_grows_with_the_place_alone(round_and_round: OnLine) 
     kinds = [chr(gtsam.symbolChr(key)) for key in memory.known.sizes]
     assert kinds.count("M") == len(memory.tiles)
     assert kinds.count("X") <= len(memory.tiles) + 1  # anchors, and the last key pose
+
+
+def test_what_waves_leave_out_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if the vehicle had come to each place a thousand times before: little is learnt there.
+
+    Less than a half of what first visits tell of the calibrations, and poses are as sure as they
+    are right.
+    """
+    options = SlamOptions.model_validate({**QUICK, "calibration": "refined"})
+    own = random_sensors(6, 6)
+    known = calibrated(own, sigma=OFF)
+    drive, true = prepared_drive(6, laps(45, SMALL), own, known, options)
+    found = [OnLine.over(drive, true, options, ExploringOptions())]
+    new = RememberedTile.new
+    monkeypatch.setattr(RememberedTile, "new", lambda *its: replace(new(*its), returns=1000))
+    found.append(OnLine.over(drive, true, options, ExploringOptions()))
+    sigma = [
+        np.sqrt(np.diagonal(each.beliefs[-1].calibration_covariance, axis1=1, axis2=2)) / OFF
+        for each in found
+    ]
+    first, again = (1 - each**2 for each in sigma)
+    assert again.sum() < 0.5 * first.sum()
+    assert (again < first + 0.1).all()
+    assert found[1].nees().mean() < 6
 
 
 def test_what_is_remembered_stays_a_covariance(round_and_round: OnLine) -> None:

@@ -101,7 +101,11 @@ def test_a_posterior_tells_what_a_step_promises(
     solution = linear.optimize(colamd_ordering(graph), gtsam.EliminateQR)
     promised = linear.error(away.zeroVectors()) - linear.error(solution)
     assert promised > 1.0
-    assert joint_posterior(linear, keys).decrease == pytest.approx(promised, rel=1e-6)
+    found = joint_posterior(linear, keys)
+    assert found.decrease == pytest.approx(promised, rel=1e-6)
+    mean = np.concatenate([solution.at(key) for key in keys])
+    # Cholesky loses digits where poses are far apart, far below what is known of them.
+    assert np.abs((found.mean - mean) / np.sqrt(np.diag(found.covariance))).max() < 1e-3
 
 
 @pytest.mark.parametrize(("start", "step"), FAR_APART)

@@ -70,6 +70,15 @@ def test_a_folder_of_a_bag_with_a_pipe(tmp_path: Path) -> None:
         opened_log(bag)
 
 
+def test_a_folder_that_is_no_bag_names_what_is_in_it(tmp_path: Path) -> None:
+    with pytest.raises(L2MError, match=r"without metadata.yaml; there is no bag in it; accepted"):
+        opened_log(tmp_path)
+    (tmp_path / "day_2.bag").touch()
+    (tmp_path / "day_1.mcap").touch()
+    with pytest.raises(L2MError, match=r"without metadata.yaml; a bag in it is day_1.mcap"):
+        opened_log(tmp_path)
+
+
 def test_an_outcome_that_is_a_pipe_counts_as_none(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "outcome.json")
     with ends_within(10):
