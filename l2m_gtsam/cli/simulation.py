@@ -60,6 +60,7 @@ def demo(
     """Simulate, map and calibrate a warehouse, and compare with the truth."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import OVERVIEW_FILE, calibrate_bag
+        from l2m_gtsam.batch.files import ensure_folder
         from l2m_gtsam.batch.maps import build_map_file
         from l2m_gtsam.batch.reports import REPORT_FILE, calibration_results, report_folder
         from l2m_gtsam.batch.simulation import STRUCTURE_FILE, SUITE_FILE, bag_name, simulate_bags
@@ -68,6 +69,7 @@ def demo(
         from l2m_gtsam.simulate.bag_writer import BagKind
 
         wanted, chosen, map_path = _scenario(options, seed), Config(), out / "map.npz"
+        ensure_folder(out)
         truth = simulate_bags(out, wanted, [BagKind.MCAP], progress).truth
         mapping, drive = (out / bag_name(each, BagKind.MCAP) for each in ("mapping", "calibration"))
         cloud = str(out / STRUCTURE_FILE)

@@ -1,6 +1,7 @@
 """What commands have in common: arguments, tables, warnings and progress at a terminal."""
 
 import os
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -168,7 +169,8 @@ def shown_progress() -> "Iterator[Progress]":
     """Show one bar per stage on the error stream while it runs.
 
     One named "starting" is there from the first until there is a stage: what a command
-    needs is best imported inside.
+    needs is best imported inside. Where the stream is no terminal each stage is a line when it
+    begins.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -182,6 +184,9 @@ def shown_progress() -> "Iterator[Progress]":
         TimeLeftColumn(),
     )
     console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _stage_lines()
+        return
     with Progress(*columns, console=console, speed_estimate_period=ESTIMATE_S) as bars:
         stages: dict[str, TaskID] = {}
         starting = [bars.add_task(STARTING, total=None)]
@@ -199,6 +204,18 @@ def shown_progress() -> "Iterator[Progress]":
         finally:
             while starting:
                 bars.remove_task(starting.pop())
+
+
+def _stage_lines() -> "Progress":
+    """Return what writes the name of each stage to the error stream, once."""
+    seen: set[str] = set()
+
+    def report(stage: str, _fraction: float) -> None:
+        if stage not in seen:
+            seen.add(stage)
+            print(shown(stage, LONGEST_STAGE), file=sys.stderr, flush=True)
+
+    return report
 
 
 def _show_control_characters(table: "Table") -> None:

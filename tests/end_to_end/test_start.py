@@ -1,6 +1,7 @@
 """A command shows its first bar before it loads what it computes with."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -25,6 +26,7 @@ LOADED = f"import json, sys; print(json.dumps([each for each in {HEAVY} if each 
 # first bar it says what is loaded, and ends.
 AT_THE_FIRST_BAR = f"""
 import json
+import os
 import os
 import sys
 from rich.progress import Progress
@@ -70,7 +72,11 @@ COMMANDS = {
 def said(code: str, *arguments: str) -> list[list[str]]:
     """What a program prints, line by line."""
     done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "FORCE_COLOR": "1"},  # as a terminal: elsewhere stages are lines
     )
     return [json.loads(line) for line in done.stdout.splitlines()]
 

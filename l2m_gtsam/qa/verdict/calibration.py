@@ -221,7 +221,12 @@ def measured(
         _in("sigma of H", "µT", _largest(sensor.H_sigma), options.hard_iron_sigma_ut),
         _in("unexplained by the map", "", found.fit.unexplained, options.unexplained),
         _in("chi-square", "", chi2, options.chi_square),
-        _in("halves apart", "", furthest(found.halves, options), options.halves_apart),
+        _in(
+            "halves apart, over what chance allows",
+            "",
+            furthest(found.halves, options),
+            options.halves_apart,
+        ),
         _in("rejected", "%", _share(sensor.rejected, inside), options.rejected, 100),
         _in(
             "outside the map",

@@ -6,7 +6,7 @@ from rich.text import Text
 
 from l2m_gtsam.cli.tables import add_text, new_table
 from l2m_gtsam.cli.tables.calibration import HEADINGS, calibration_table
-from l2m_gtsam.cli.terminal import print_table, print_verdict
+from l2m_gtsam.cli.terminal import print_table, print_verdict, shown_progress
 from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Verdict
 from tests.drives.calibrations import calibration, sensor
 
@@ -84,3 +84,15 @@ def test_control_characters_of_names_are_text(
     out = "\n".join(lines_of(table, 200, monkeypatch, capsys))
     assert out.count("/mag\\x1b]0;title\\x07\\u202e\\n") == 4
     assert not {"\x1b", "\x07", "\u202e"} & set(out)
+
+
+def test_where_there_is_no_terminal_a_stage_is_a_line_when_it_begins(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with shown_progress() as progress:
+        progress("reading", 0.0)
+        assert capsys.readouterr().err == "reading\n"
+        progress("reading", 0.5)
+        progress("sol\x1bving", 0.0)
+        assert capsys.readouterr().err == "sol\\x1bving\n"
+    assert capsys.readouterr().err == ""
