@@ -157,8 +157,9 @@ def _verdict(
         )
         return LocalisationStatus.OUTSIDE_MAP, message
     if judged < LEAST_EXPLAINED or max(chi2, solution.odometry_chi2) > LARGEST_CHI2:
+        left = f", leaves {chi2:.1f} times the variance of their noise" if np.isfinite(chi2) else ""
         message = (
-            f"{explains}, leaves {chi2:.1f} times the variance of their noise, and needs steps "
+            f"{explains}{left}, and needs steps "
             f"that differ from odometry by {solution.odometry_chi2:.1f} times its variance: "
             "another place, a wrong start, or a wrong calibration"
         )

@@ -159,7 +159,7 @@ def _map(picture: MapPicture, values: Rows, label: str, colours: str) -> tuple[F
     left, right, bottom, top = picture.extent
     figure, axes = wide(np.array([right - left, top - bottom]))
     draw_map(figure, axes, np.array(values), picture.extent, label, colours, **BELOW)
-    axes.set_title(f"at z = {picture.height:.2f} m; blank: no data")
+    axes.set_xlabel(f"x (m), at z = {picture.height:.2f} m; blank: no data")
     axes.grid(visible=False)
     axes_image(axes, np.array(values), picture.extent, "µT")
     return figure, axes
