@@ -50,6 +50,7 @@ AXIS = re.compile(r"^(.*?)[\s._/\-]*([wxyz])$")
 INDEX = re.compile(r"^(.*?)\[([0-2])\]$")
 WORDS = re.compile(r"[\s._/\-]+")
 FIELDS = ("b", "m", "h")
+QUATERNIONS = ("q", "quat", "quaternion", "orientation", "rotation")
 POSITIONS = ("p", "pos", "position", "t", "trans", "translation", "")
 
 
@@ -83,6 +84,8 @@ class Roles:
         Magnetometers by name.
     position, orientation
         Columns of poses, if there are any: x, y, z and x, y, z, w.
+    left_out
+        Groups of columns that are of no use as one of them is missing, a clause each.
     """
 
     stamp: tuple[int, ...]
@@ -90,6 +93,7 @@ class Roles:
     fields: Mapping[str, FieldColumns]
     position: tuple[int, int, int] | None
     orientation: tuple[int, int, int, int] | None
+    left_out: tuple[str, ...] = ()
 
 
 def column_roles(names: Sequence[str], options: ColumnOptions, stem: str) -> Roles:
@@ -122,6 +126,7 @@ def column_roles(names: Sequence[str], options: ColumnOptions, stem: str) -> Rol
         _fields(names, parts, magnetic, options, stem),
         _position(names, others, options),
         orientation,
+        _left_out(names, parts),
     )
 
 
@@ -179,7 +184,26 @@ def _time_unit(name: Name) -> TimeUnit:
     return TIME_UNITS.get(name.unit) or TIME_UNITS.get(ending) or TimeUnit.AUTO
 
 
+def _left_out(names: Sequence[str], parts: Sequence[Name]) -> tuple[str, ...]:
+    groups, found = _groups(parts), []
+    turned = any({"x", "y", "z", "w"} <= set(axes) for axes in groups.values())
+    for base, axes in groups.items():
+        wanted = "xyzw" if _last(base) in QUATERNIONS else "xyz"
+        likely = wanted == "xyzw" or _is_magnetic(base, bare=False)
+        likely |= turned and _last(base) in POSITIONS
+        missing = [axis for axis in wanted if axis not in axes]
+        if likely and len(missing) == 1:
+            known = ", ".join(names[column].strip() for column in sorted(axes.values()))
+            found.append(f"{known} without the one of {missing[0]}")
+    return tuple(found)
+
+
 def _vectors(parts: Sequence[Name]) -> dict[str, dict[str, int]]:
+    """Return columns by what stands before their axis, and the axis, where none is missing."""
+    return {base: axes for base, axes in _groups(parts).items() if {"x", "y", "z"} <= set(axes)}
+
+
+def _groups(parts: Sequence[Name]) -> dict[str, dict[str, int]]:
     """Return columns by what stands before their axis, and the axis."""
     found: dict[str, dict[str, int]] = {}
     for k, part in enumerate(parts):
@@ -187,7 +211,7 @@ def _vectors(parts: Sequence[Name]) -> dict[str, dict[str, int]]:
             found.setdefault(match[1], {}).setdefault("xyz"[int(match[2])], k)
         elif match := AXIS.match(_without_unit(part.text)):
             found.setdefault(match[1], {}).setdefault(match[2], k)
-    return {base: axes for base, axes in found.items() if {"x", "y", "z"} <= set(axes)}
+    return found
 
 
 def _without_unit(text: str) -> str:

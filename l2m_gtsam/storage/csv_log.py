@@ -1,6 +1,7 @@
 """Logs and trajectories in CSV with named columns."""
 
 import csv
+import warnings
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,13 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.errors import BagError
+from l2m_gtsam.errors import BagError, Notice
 from l2m_gtsam.storage.bag_options import ColumnOptions, TimeUnit
 from l2m_gtsam.storage.csv_columns import Roles, column_roles
 from l2m_gtsam.storage.field_types import CSV_FIELD_TYPE
 from l2m_gtsam.storage.files import open_text
 from l2m_gtsam.storage.log import TableLog, TableTopic
 from l2m_gtsam.storage.messages import CSV_POSE_TYPE, Orientation, Position
+from l2m_gtsam.text.shown import shown
 
 NS_PER = {
     TimeUnit.SECONDS: 1_000_000_000,
@@ -91,6 +93,8 @@ def read_csv_log(path: Path, options: ColumnOptions) -> TableLog:
         The file is missing or no such table; the line of it is named.
     """
     table = read_table(path, options)
+    for each in table.roles.left_out:
+        warnings.warn(f"{path}: left out: columns {shown(each)}", Notice, stacklevel=2)
     channels = [_readings(table, name) for name in table.roles.fields]
     if table.roles.position is not None and table.roles.orientation is not None:
         channels.append(TableTopic(POSE_TOPIC, CSV_POSE_TYPE, *_poses(table)))

@@ -11,7 +11,7 @@ from pyulog import ULog
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.errors import BagError, UnitsError
+from l2m_gtsam.errors import BagError, Notice, UnitsError
 from l2m_gtsam.storage.bag import read_fields, read_recording, read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions, ColumnOptions, PoseFileOptions, RegressorTopic
 from l2m_gtsam.storage.inspect import inspect_bag
@@ -200,6 +200,23 @@ def test_what_is_no_log_is_one_line(tmp_path: Path, text: str, told: str) -> Non
         read_recording(path, BagOptions())
     assert str(error.value).startswith(str(path))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("head", "said"),
+    [
+        ("mag_y,mag_x,x,y,z,qx,qy,qz,qw", "columns mag_y, mag_x without the one of z"),
+        ("bx,by,bz,x,y,z,qx,qy,qz", "columns qx, qy, qz without the one of w"),
+        ("bx,by,bz,pos_x,pos_z,q_w,q_x,q_y,q_z", "columns pos_x, pos_z without the one of y"),
+    ],
+)
+def test_columns_of_which_one_is_missing_are_named(tmp_path: Path, head: str, said: str) -> None:
+    path = tmp_path / "log.csv"
+    count = head.count(",") + 1
+    lines = (f"{k}," + ",".join(str(k + column) for column in range(count)) for k in range(3))
+    path.write_text("\n".join(["stamp," + head, *lines]))
+    with pytest.warns(Notice, match=f"log.csv: left out: {said}"):
+        inspect_bag(path, BagOptions())
 
 
 def ned(p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
