@@ -264,13 +264,13 @@ def _nothing_solved(
 ) -> str:
     """Return why; ``covered`` is whether the map has data where the lidar was."""
     place = map_source.path if map_source else "the map"
-    outside = [sensor.status is SensorStatus.OUTSIDE_MAP for sensor in sensors]
-    if covered and not all(outside):
+    if covered:
         return (
             f"{recording.source.path}: no sensor can be solved, although {place} covers the drive: "
-            f"{sensors[0].sensor}: {sensors[0].message}"
+            f"{sensors[0].sensor}: {sensors[0].message}; is it the map of another place, or is the "
+            "start of a sensor wrong?"
         )
-    if any(outside):
+    if any(sensor.status is SensorStatus.OUTSIDE_MAP for sensor in sensors):
         low, high = recording.trajectory.p.min(axis=0), recording.trajectory.p.max(axis=0)
         return (
             f"{place} does not cover the drive {recording.source.path}, which runs from "

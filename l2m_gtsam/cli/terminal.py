@@ -1,7 +1,6 @@
 """What commands have in common: arguments, tables, warnings and progress at a terminal."""
 
 import os
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -213,7 +212,7 @@ def _stage_lines() -> "Progress":
     def report(stage: str, _fraction: float) -> None:
         if stage not in seen:
             seen.add(stage)
-            print(shown(stage, LONGEST_STAGE), file=sys.stderr, flush=True)
+            typer.echo(shown(stage, LONGEST_STAGE), err=True)
 
     return report
 

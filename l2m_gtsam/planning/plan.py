@@ -131,7 +131,8 @@ def plan(
         raise CalibrationError(f"the map does not cover the drive {recording.source.path}")
     sensors = _sensor_plans(synchronised, recording.trajectory, found, task)
     worsts = [worst(each.sensor, each.covariance, options.solve.rank) for each in sensors]
-    least = max(range(len(sensors)), key=lambda index: worsts[index].badness)
+    read = np.unique(readings.sensor).tolist()
+    least = max(read, key=lambda index: worsts[index].badness)
     # The other sensors are known better: what a motion does for them need not be asked.
     one, alone = task.of(least), only(readings, least)
     motions = _with_motions(one, alone, _motions(alone, solver_map, planning), progress)

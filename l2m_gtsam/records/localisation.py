@@ -230,7 +230,7 @@ class Gain(Record):
         change = "likelier" if self.likelier > 0 else "less likely"
         return (
             f"poses that the readings correct by {self.moved_m:.2g} m rms make the readings "
-            f"{change} by exp({abs(self.likelier):.0f}), but are further from the truth than "
+            f"{change} by exp({abs(self.likelier):.0f}), and are further from the truth than "
             f"odometry with a probability of {self.doubt:.2g}"
         )
 

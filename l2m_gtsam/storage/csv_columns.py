@@ -50,7 +50,7 @@ AXIS = re.compile(r"^(.*?)[\s._/\-]*([wxyz])$")
 INDEX = re.compile(r"^(.*?)\[([0-2])\]$")
 WORDS = re.compile(r"[\s._/\-]+")
 FIELDS = ("b", "m", "h")
-QUATERNIONS = ("q", "quat", "quaternion", "orientation", "rotation")
+QUATERNIONS = ("q", "quat", "quaternion", "orientation")
 POSITIONS = ("p", "pos", "position", "t", "trans", "translation", "")
 
 
@@ -126,7 +126,7 @@ def column_roles(names: Sequence[str], options: ColumnOptions, stem: str) -> Rol
         _fields(names, parts, magnetic, options, stem),
         _position(names, others, options),
         orientation,
-        _left_out(names, parts),
+        _left_out(names, parts, options),
     )
 
 
@@ -184,10 +184,17 @@ def _time_unit(name: Name) -> TimeUnit:
     return TIME_UNITS.get(name.unit) or TIME_UNITS.get(ending) or TimeUnit.AUTO
 
 
-def _left_out(names: Sequence[str], parts: Sequence[Name]) -> tuple[str, ...]:
+def _left_out(
+    names: Sequence[str], parts: Sequence[Name], options: ColumnOptions
+) -> tuple[str, ...]:
+    if options.fields or options.position or options.orientation:
+        return ()  # whoever names columns knows them
     groups, found = _groups(parts), []
+    texts = {part.text for part in parts}
     turned = any({"x", "y", "z", "w"} <= set(axes) for axes in groups.values())
     for base, axes in groups.items():
+        if f"{base}[3]" in texts:  # numbered, the scalar first or last
+            continue
         wanted = "xyzw" if _last(base) in QUATERNIONS else "xyz"
         likely = wanted == "xyzw" or _is_magnetic(base, bare=False)
         likely |= turned and _last(base) in POSITIONS

@@ -1,7 +1,7 @@
 """Files of sensors whose place and distortion are known, and how well they are known."""
 
 import warnings
-from dataclasses import fields, replace
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator,
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Matrix, Vector
 from l2m_gtsam.errors import CalibrationError, Notice
-from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus, TimeOffset
+from l2m_gtsam.records.calibration import SensorStatus, TimeOffset
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.yaml_file import checked, read_yaml, write_yaml
 
@@ -19,7 +19,7 @@ SIZE, TAU = 16, 15  # (t, C row by row, H, time offset); the last is the offset
 SHAPES = {"t_sigma": (3,), "C_sigma": (3, 3), "H_sigma": (3,)}
 ROUNDING = 1e-6  # of a variance, of numbers written with few digits
 FARTHEST_M = 100.0  # of a sensor from the lidar: beyond it, its place is written in millimetres
-LIKE = 0.75  # of ``difflib``: a key so like one that is known is a misspelt one
+LIKE = 0.85  # of ``difflib``: two letters of seven that changed places
 # What a calibration leaves open is anywhere within these sigmas: metres, 1, uT, seconds.
 OPEN = np.repeat([1.0, 1.0, 100.0, 0.1], [3, 9, 3, 1])
 
@@ -165,7 +165,8 @@ class _Known(_Finite):
     @classmethod
     def _well_spelt(cls, entry: Any) -> Any:
         for key in map(str, entry) if isinstance(entry, dict) else ():
-            if key not in KEYS and (meant := _meant(key)):
+            meant = _meant(key)
+            if meant is not None and meant not in entry:
                 raise ValueError(f"unknown key {key}; is {meant} meant?")
         return entry
 
@@ -233,14 +234,12 @@ class ListedSensor(_Known):
         return TimeOffset(self.time_offset.seconds, float("inf"), np.zeros(15), "it is listed")
 
 
-# Of an entry, in a list by hand or in the file of a calibration.
-KEYS = {*ListedSensor.model_fields, *StatedErrors.model_fields}
-KEYS |= {each.name for each in fields(SensorCalibration)}
+KEYS = sorted({*ListedSensor.model_fields, *StatedErrors.model_fields})  # that are read
 
 
 def _meant(key: str) -> str | None:
-    """Return the key that a misspelt one is like; None if it is none of these."""
-    by_lower = {each.lower(): each for each in sorted(KEYS)}
+    """Return the key that one is so like that it must be meant; None if it is none of these."""
+    by_lower = {each.lower(): each for each in KEYS}
     near = get_close_matches(key.lower(), by_lower, 1, LIKE)
     return by_lower[near[0]] if near else None
 

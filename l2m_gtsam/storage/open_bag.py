@@ -22,7 +22,7 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bounded import is_there, require_regular
 from l2m_gtsam.storage.drive_lists import ROS2_HEADER, is_bag
-from l2m_gtsam.storage.log import ACCEPTED, DRIVES, TABLES, Message
+from l2m_gtsam.storage.log import ACCEPTED, TABLES, Message
 from l2m_gtsam.storage.messages import TF_TYPE, TF_TYPES
 from l2m_gtsam.storage.rosbags_bounds import (
     MOST_DEFINITION,
@@ -228,10 +228,16 @@ def _check_files(path: Path) -> None:
         if file.suffix in STORED:
             require_regular(file, BagError)
     if not is_bag(path):
-        within = (each for each in path.iterdir() if each.suffix in DRIVES or is_bag(each))
-        logs = sorted(each.name for each in within)
+        logs = sorted(each.name for each in path.iterdir() if _may_be_bag(each))
         there = f"a bag in it is {shown(logs[0])}" if logs else "there is no bag in it"
         raise BagError(f"{path}: a folder without {ROS2_HEADER}; {there}; accepted: {ACCEPTED}")
+
+
+def _may_be_bag(path: Path) -> bool:
+    try:
+        return is_bag(path)
+    except BagError:  # a folder that cannot be read
+        return False
 
 
 def _check_content(path: Path, reader: Ros1Reader | Ros2Reader) -> None:

@@ -27,7 +27,6 @@ LOADED = f"import json, sys; print(json.dumps([each for each in {HEAVY} if each 
 AT_THE_FIRST_BAR = f"""
 import json
 import os
-import os
 import sys
 from rich.progress import Progress
 from l2m_gtsam.cli.app import main

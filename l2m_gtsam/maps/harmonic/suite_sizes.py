@@ -117,7 +117,9 @@ def stated_size(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> StatedSize 
         As in ``suite_sizes``; the covariance is the one stated.
     """
     turned, part = differences(len(suite.sensors))
-    known = np.einsum("ij,ij->j", turned, suite.covariance @ turned) > 0
+    variance = np.einsum("ij,ij->j", turned, suite.covariance @ turned)
+    apart = np.einsum("ij,i,ij->j", turned, np.diag(suite.covariance), turned)
+    known = variance > NOTHING * apart  # sensors may have all of an error in common
     turned, part = turned[:, known], part[known]
     stated = stated_modes(turned.T @ suite.covariance @ turned, np.isin(part, JUDGED))
     judged = stated.judged

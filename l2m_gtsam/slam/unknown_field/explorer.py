@@ -197,7 +197,8 @@ class Explorer:
             return own
         own._memory, own._past = state.memory, list(state.past)
         own._first = own._solved = state.last
-        own._section = OpenSection(sensors, state.prior, options, state.memory, state.last)
+        here = frozenset({state.memory.tile_at(state.last, state.prior.options.core)})
+        own._section = OpenSection(sensors, state.prior, options, state.memory, state.last, here)
         own._belief = state.memory.belief(state.last, sensors)
         return own
 

@@ -87,6 +87,11 @@ class FieldMemory:
         """Keys of the calibrations that are variables, position and distortion by turns."""
         return [key for key in self.known.sizes if gtsam.symbolChr(key) in CALIBRATION]
 
+    def tile_at(self, number: int, core: float) -> int:
+        """Return the number of the tile of a key pose; the next number if it is in none."""
+        anchors = [self.known.values.atPose3(X(tile.anchor)) for tile in self.tiles]
+        return tile_of(self.known.values.atPose3(X(number)), anchors, core)
+
     def belief(self, number: int, sensors: KnownSensors) -> Belief:
         """Return what is known of a key pose, and of sensors as far as they are variables."""
         known = self.known.marginal([X(number), *self.calibrations])

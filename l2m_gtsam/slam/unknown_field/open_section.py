@@ -161,7 +161,9 @@ class OpenSection:
         times = {number: max(self._tiles[number].returns, 1) for number in self._tile_of.values()}
         if max(times.values()) == 1:
             return self._after
-        graph = yield from self._whole(self._weighed(self._last + 2, 1.0, times))
+        none_is_new = self._last + 2  # readings come with the key pose after them
+        self._counted = self._weighed(none_is_new, 1.0, times)
+        graph = yield from self._whole(self._counted)
         linear, keys = graph.linearize(self._values), self._kept()[:-1]
         yield
         found, sizes = joint_posterior(linear, keys), {key: self._size(key) for key in keys}

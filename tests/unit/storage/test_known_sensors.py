@@ -82,7 +82,9 @@ def test_impossible_errors_are_refused_in_one_line(
 
 
 def test_what_is_noted_beside_is_no_misspelt_key(tmp_path: Path) -> None:
-    assert read(tmp_path, R_lidar_mag=np.eye(3).tolist(), serial="A7", bought="2024-05-01") is None
+    notes = {"serial": "A7", "comment": "left", "model": "RM3100", "sensor_id": 3, "noise_ut": 0.1}
+    frames = {"R_lidar_mag": np.eye(3).tolist(), "T_lidar_mag": [1.0], "t_lidar_imu": [0, 0, 1]}
+    assert read(tmp_path, **notes, **frames) is None
 
 
 def test_a_suite_of_which_nothing_is_solved_says_so(tmp_path: Path) -> None:

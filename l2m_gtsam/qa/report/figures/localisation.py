@@ -65,6 +65,8 @@ def path_figure(path: LocalisedTrajectory, picture: MapPicture, truth: Rows | No
         axes.plot(*np.array(truth)[keep, :2].T, ":", color="#ff4fd8", linewidth=1.6, label="truth")
     scale = ellipse_scale(path, picture)
     for k in _chosen(path):
+        if not np.isfinite(path.covariance[k, :2, :2]).all():
+            continue
         shape = ellipse(path.p[k, :2], path.covariance[k, :2, :2], scale)
         shape.set(facecolor="#ffffff66", edgecolor="black")
         axes.add_patch(shape)
