@@ -163,11 +163,9 @@ def stated_modes(covariance: FloatArray, judged: BoolArray) -> StatedModes:
     carried = correlation[:, others] @ first / np.sum(first**2, axis=0)
     left = correlation - carried @ carried.T
     last = np.flatnonzero(judged)
-    own = np.zeros((len(judged), 0))
-    if len(last):
-        rest = determined_root(left[np.ix_(last, last)])
-        own = np.zeros((len(judged), rest.shape[1]))
-        own[last] = rest
+    rest = determined_root(left[np.ix_(last, last)])
+    own = np.zeros((len(judged), rest.shape[1]))
+    own[last] = rest
     root = sigma[:, None] * np.hstack([carried, own])
     return StatedModes(root, np.arange(root.shape[1]) >= carried.shape[1])
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
+from types import MappingProxyType
 
 import gtsam
 import numpy as np
@@ -44,6 +45,7 @@ from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile, level_axes
 ONWARDS = (4.0,)
 AGAIN = (16.0, 4.0)
 CLOSE = 0.5  # decrease of the error: a step of a sigma, of hundreds of variables together
+ONCE: Mapping[int, int] = MappingProxyType({})  # what waves leave out counts, in every tile
 SOFT = 1.0  # convexity of the loss for new readings, mu of ``solve.robust``
 
 
@@ -259,7 +261,7 @@ class OpenSection:
         return place_readings(readings, own, self._sensors)
 
     def _weighed(
-        self, new: int, scale: float, times: Mapping[int, int] | None = None
+        self, new: int, scale: float, times: Mapping[int, int] = ONCE
     ) -> list[TileReadings]:
         """Return all readings with weights by their tiles' current predictions.
 
@@ -280,7 +282,7 @@ class OpenSection:
                 np.flatnonzero(owner == number),
                 new,
                 scale,
-                1 if times is None else times[number],
+                times.get(number, 1),
             )
             for number in np.unique(owner).tolist()
         ]
