@@ -15,8 +15,9 @@ from benchmarks.timing import seconds
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, prior_factors
+from l2m_gtsam.slam.marginals import joint_posterior
 from l2m_gtsam.slam.online.belief import kalman_gain
-from l2m_gtsam.slam.solver import colamd_ordering, joint_posterior, levenberg_marquardt
+from l2m_gtsam.slam.solver import colamd_ordering, levenberg_marquardt
 from tests.reference.dense_newton import newton
 
 STEPS = 3  # of a section's last stage, as measured

@@ -25,6 +25,13 @@ from l2m_gtsam.slam.map_prediction import (
     predict,
     sensors_in,
 )
+from l2m_gtsam.slam.marginals import (
+    Marginals,
+    jump_covariances,
+    odometry_scale,
+    pose_covariances,
+    sensor_covariances,
+)
 from l2m_gtsam.slam.online.follower import Follower, follow
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
@@ -37,15 +44,7 @@ from l2m_gtsam.slam.pose_graph import (
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
-from l2m_gtsam.slam.solver import (
-    Marginals,
-    colamd_ordering,
-    jump_covariances,
-    levenberg_marquardt,
-    odometry_scale,
-    pose_covariances,
-    sensor_covariances,
-)
+from l2m_gtsam.slam.solver import colamd_ordering, levenberg_marquardt
 from l2m_gtsam.solve.robust import WEIGHTS
 
 # Stages of graduated non-convexity: the drive was followed, so that good readings are near already.

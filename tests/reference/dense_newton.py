@@ -14,7 +14,7 @@ from l2m_gtsam.slam.joint_gaussian import (
     retracted,
     slices_of,
 )
-from l2m_gtsam.slam.solver import ordered
+from l2m_gtsam.slam.marginals import ordered
 
 STEPS = 30
 

@@ -26,6 +26,7 @@ from l2m_gtsam.slam.joint_gaussian import JointGaussian, prior_factors
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.map_prediction import sensors_in
+from l2m_gtsam.slam.marginals import reported_ill_conditioning
 from l2m_gtsam.slam.online.belief import POSE, Belief, PredictedBelief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, key_poses_of
 from l2m_gtsam.slam.online.measurements import (
@@ -46,7 +47,6 @@ from l2m_gtsam.slam.pose_graph import (
     link_pose,
     start_factor,
 )
-from l2m_gtsam.slam.solver import reported_ill_conditioning
 from l2m_gtsam.solve.robust import RobustOptions
 
 POSITION, DISTORTION = 3, 12  # components of a sensor's variables

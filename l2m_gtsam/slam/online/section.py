@@ -7,8 +7,8 @@ import numpy as np
 
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.marginals import net_covariance, ordered, unless_indeterminate
 from l2m_gtsam.slam.online.belief import POSE
-from l2m_gtsam.slam.solver import net_covariance, ordered, unless_indeterminate
 
 # Steps after which a variable is relinearised: rad and m, as a field is curved within decimetres;
 # entries of C; never for H, in which readings are linear.

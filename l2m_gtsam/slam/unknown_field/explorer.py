@@ -24,10 +24,10 @@ from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.options import Options
 from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_transform
 from l2m_gtsam.slam.links import Links, carried_on, seen_from_before
+from l2m_gtsam.slam.marginals import reported_ill_conditioning
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
-from l2m_gtsam.slam.solver import reported_ill_conditioning
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory
 from l2m_gtsam.slam.unknown_field.open_section import OpenSection
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, drive_prior

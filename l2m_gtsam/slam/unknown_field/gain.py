@@ -28,7 +28,7 @@ from l2m_factors import X
 from l2m_gtsam.data import BoolArray
 from l2m_gtsam.records.localisation import Gain
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.solver import PoseCovariance
+from l2m_gtsam.slam.marginals import PoseCovariance
 from l2m_gtsam.slam.unknown_field.linear_field import AXES
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 

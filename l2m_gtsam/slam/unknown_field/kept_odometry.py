@@ -8,6 +8,7 @@ import numpy as np
 from l2m_factors import M
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.marginals import Marginals, jump_covariances, pose_covariances
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
     calibration_graph,
@@ -18,7 +19,7 @@ from l2m_gtsam.slam.pose_graph import (
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import DriveSolution
-from l2m_gtsam.slam.solver import Marginals, colamd_ordering, jump_covariances, pose_covariances
+from l2m_gtsam.slam.solver import colamd_ordering
 from l2m_gtsam.slam.unknown_field.gain import gain_of, readings_log_likelihood
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from l2m_gtsam.slam.unknown_field.tiled_smoother import AWAY_M, FieldSolution, in_map

@@ -26,15 +26,12 @@ from l2m_gtsam.slam.map_prediction import (
     place_readings,
     sensors_in,
 )
+from l2m_gtsam.slam.marginals import joint_posterior
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import between_factor, link_graph
-from l2m_gtsam.slam.solver import (
-    colamd_ordering,
-    joint_posterior,
-    stepwise_levenberg_marquardt,
-)
+from l2m_gtsam.slam.solver import colamd_ordering, stepwise_levenberg_marquardt
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile, tile_of
 from l2m_gtsam.slam.unknown_field.section_readings import SectionReadings, TileReadings
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile

@@ -25,10 +25,11 @@ from l2m_factors import X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.marginals import Marginals, pose_covariances
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.pose_graph import odometry_graph
 from l2m_gtsam.slam.relative_motion import RelativeMotions
-from l2m_gtsam.slam.solver import Marginals, colamd_ordering, pose_covariances
+from l2m_gtsam.slam.solver import colamd_ordering
 from l2m_gtsam.slam.unknown_field.path_density import PathDensity, PathReadings
 from l2m_gtsam.slam.unknown_field.sensor_noise import NS, NoiseInformation, SensorNoise
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior

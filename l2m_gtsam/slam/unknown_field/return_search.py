@@ -18,9 +18,10 @@ from l2m_factors import KeyPoseReadings, X
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import poses_in
+from l2m_gtsam.slam.marginals import Marginals
 from l2m_gtsam.slam.pose_graph import drive_graph, drive_values
 from l2m_gtsam.slam.relative_motion import RelativeMotions
-from l2m_gtsam.slam.solver import Marginals, colamd_ordering
+from l2m_gtsam.slam.solver import colamd_ordering
 from l2m_gtsam.slam.unknown_field.changed_visits import Remembered, Seen
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile, anchored, occupied_tiles
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, visits_among

@@ -15,6 +15,14 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.localisation import Gain
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction, place_readings, poses_in, sensors_in
+from l2m_gtsam.slam.marginals import (
+    Marginals,
+    PoseCovariance,
+    jump_covariances,
+    odometry_scale,
+    pose_covariances_together,
+    sensor_covariances,
+)
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
     calibration_graph,
@@ -27,16 +35,7 @@ from l2m_gtsam.slam.pose_graph import (
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
-from l2m_gtsam.slam.solver import (
-    Marginals,
-    PoseCovariance,
-    jump_covariances,
-    levenberg_marquardt,
-    odometry_scale,
-    pose_covariances_together,
-    sensor_covariances,
-    weights_first,
-)
+from l2m_gtsam.slam.solver import levenberg_marquardt, weights_first
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from l2m_gtsam.solve.robust import WEIGHTS

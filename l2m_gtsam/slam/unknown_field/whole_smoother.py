@@ -16,10 +16,11 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, poses_in
+from l2m_gtsam.slam.marginals import Marginals, pose_covariances
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import drive_graph, drive_values
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
-from l2m_gtsam.slam.solver import Marginals, colamd_ordering, pose_covariances
+from l2m_gtsam.slam.solver import colamd_ordering
 from l2m_gtsam.slam.unknown_field.gain import gain_of
 from l2m_gtsam.slam.unknown_field.path_information import path_information
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise

@@ -9,8 +9,9 @@ from scipy.stats import multivariate_normal
 
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.marginals import Marginals
 from l2m_gtsam.slam.relative_motion import RelativeMotions
-from l2m_gtsam.slam.solver import Marginals, colamd_ordering
+from l2m_gtsam.slam.solver import colamd_ordering
 from l2m_gtsam.slam.unknown_field.gain import NOISE, gain_of, readings_log_likelihood
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from tests.drives.drawn import DrawnDrive, drawn_drive

@@ -15,7 +15,8 @@ from l2m_gtsam.slam.joint_gaussian import (
     prior_factors,
     retracted,
 )
-from l2m_gtsam.slam.solver import colamd_ordering, joint_posterior, levenberg_marquardt, ordered
+from l2m_gtsam.slam.marginals import joint_posterior, ordered
+from l2m_gtsam.slam.solver import colamd_ordering, levenberg_marquardt
 from tests.reference.dense_newton import newton
 
 ROUNDING = 1e-8  # of matrices of condition 1e4, with 1e-12 added to correlations
