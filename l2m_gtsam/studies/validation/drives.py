@@ -44,6 +44,8 @@ class TrueCause(StrEnum):
     """Steel beside the path, and iron on the vehicle."""
     SENSOR = "sensor"
     """One sensor was turned in its place."""
+    ELSEWHERE = "elsewhere"
+    """Nothing, but the drive is through another hall than the map."""
 
 
 class ValidationStudyOptions(Options):
@@ -83,6 +85,7 @@ class ValidationStudyOptions(Options):
 
 FASTEST_M_S = 1.0
 SECONDS = 1e-9
+ANOTHER = 10_000  # seeds after a hall's own: of the hall where a drive elsewhere is
 NO_STEEL = brought_steel(np.zeros((0, 3)), np.zeros((0, 3)), np.ones(3))
 
 
@@ -189,17 +192,18 @@ def changed_drive(
 ) -> ChangedDrive:
     """Return a drive by its number, from 1, after something changed."""
     seed = drive_seed(place.seed, number)
-    path = path_of(options, place.hall, seed)
+    hall = place.hall if change is not TrueCause.ELSEWHERE else steel_hall(place.seed + ANOTHER)
+    path = path_of(options, hall, seed)
     rng, steel, at = np.random.default_rng([seed, 22]), NO_STEEL, None
     sensors = altered(options, place.sensors, change, rng)
     if change in (TrueCause.PLACE, TrueCause.BOTH):
         poses = path.trajectory
         x = poses.R @ np.mean([each.t_lidar_mag for each in sensors], axis=0) + poses.p
-        free = x[place.hall.free(x, CLEARANCE_M)]
+        free = x[hall.free(x, CLEARANCE_M)]
         at = place_beside(free, np.zeros((0, 3)), rng.uniform(*options.distance), rng)
         moment = np.exp(rng.uniform(*np.log(options.moment))) * direction(rng)
         steel = brought_steel(at[None], moment[None], np.array(options.edges))
-    return ChangedDrive(recorded(options, place.hall, path, sensors, steel), at)
+    return ChangedDrive(recorded(options, hall, path, sensors, steel), at)
 
 
 def altered(

@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.sensor import WRONG_MAP
 from l2m_gtsam.qa.verdict.validation import judge_validation
 from l2m_gtsam.records.validation import CalibrationPart, DriveValidation
-from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.studies.study import Study
 from l2m_gtsam.studies.validation.drives import (
     CalibratedHall,
@@ -80,13 +81,14 @@ def cell_of(
     found = validate(
         drive.recording, place.field_map, place.calibration, chosen, qa.validation.chance
     )
+    verdict = judge_validation(found, None, qa)
     told = [each for each in (*found.doubts, *found.notes) if " changed" in each]
     tied = any(each.startswith(TIE) for each in told)
     return ValidationCell(
         change=change,
         hall=place.seed,
-        level=judge_validation(found, None, qa).level.value,
-        right=is_right(change, drive, found) and not tied,
+        level=verdict.level.value,
+        right=is_right(change, drive, found, verdict) and not tied,
         tied=tied,
         parts=tuple(tuple(each.part.value for each in s.changes) for s in found.sensors),
         away_m=away(drive, found),
@@ -95,11 +97,16 @@ def cell_of(
     )
 
 
-def is_right(change: TrueCause, drive: ChangedDrive, found: DriveValidation) -> bool:
+def is_right(
+    change: TrueCause, drive: ChangedDrive, found: DriveValidation, verdict: Verdict
+) -> bool:
     """Return whether what changed is named, where it is, and nothing else.
 
-    A mount that is turned moves its sensors, too, which may be named or too little to be.
+    A mount that is turned moves its sensors, too, which may be named or too little to be. Of a map
+    of another place it is said that it does not fit, and nothing of steel.
     """
+    if change is TrueCause.ELSEWHERE:
+        return not found.sources and verdict.reasons[0].text.startswith(WRONG_MAP)
     off = away(drive, found)
     if (off is not None and off > NEAR_M) or (off is None) != (drive.steel is None):
         return False

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.calibrate import calibrate
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import Distortion, FieldSample, FloatArray, Recording, ScalarSeries, SourceFile
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.qa.fleet import rotations_apart
@@ -23,6 +24,12 @@ from l2m_gtsam.records.sensor_models import MovingField
 from l2m_gtsam.records.validation import CalibrationPart, DriveValidation, NamedSource, Validation
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.record_files import read_validation, write_validation
+from l2m_gtsam.studies.validation.drives import (
+    TrueCause,
+    ValidationStudyOptions,
+    calibrated_hall,
+    changed_drive,
+)
 from l2m_gtsam.validation.validate import joint_covariance, validate
 from tests.drives.calibrations import unsolved
 from tests.drives.degenerate import STRONG
@@ -214,6 +221,16 @@ def test_a_map_of_elsewhere_is_told() -> None:
     assert verdict.level == "fail"
     assert "map does not fit this drive" in verdict.reasons[0].text
     assert "offset" not in " ".join(verdict.lines(Level.PASS))
+
+
+def test_no_steel_is_made_up_where_the_map_is_of_elsewhere() -> None:
+    """Sources that bring the map of one hall near the field of another are no steel."""
+    options = ValidationStudyOptions(survey_readings=600, readings=120, sensors=1)
+    place = calibrated_hall(options, 0)
+    drive = changed_drive(options, place, TrueCause.ELSEWHERE, 1).recording
+    found = validate(drive, place.field_map, place.calibration, CalibrationOptions(), 1e-3)
+    assert found.sources == ()
+    assert "map does not fit this drive" in judged(found).reasons[0].text
 
 
 def test_a_changed_place_does_not_pull() -> None:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import Trajectory
+from l2m_gtsam.qa.verdict.sensor import WRONG_MAP
 from l2m_gtsam.records.validation import CalibrationPart
+from l2m_gtsam.records.verdict import Level, Reason, Verdict
 from l2m_gtsam.simulate.hall_drives import calibration_drive
 from l2m_gtsam.simulate.steel_hall import steel_hall
 from l2m_gtsam.studies.validation.drives import (
@@ -61,7 +63,24 @@ NONE: tuple[set[CalibrationPart], ...] = (set(), set())
 def test_right_is_what_changed_and_nothing_else(change: TrueCause, found: Any, right: bool) -> None:
     brought = change in (TrueCause.PLACE, TrueCause.BOTH)
     drive: Any = SimpleNamespace(steel=STEEL if brought else None)
-    assert is_right(change, drive, found) is right
+    assert is_right(change, drive, found, Verdict.of([], [])) is right
+
+
+@pytest.mark.parametrize(
+    ("text", "sources", "right"),
+    [
+        (f"{WRONG_MAP} The calibration was not tested.", (), True),
+        (f"{WRONG_MAP} The calibration was not tested.", (0.1,), False),
+        ("The place changed, not the vehicle", (), False),
+    ],
+)
+def test_of_another_place_it_is_said_that_the_map_does_not_fit(
+    text: str, sources: tuple[float, ...], right: bool
+) -> None:
+    verdict = Verdict.of([Reason(Level.FAIL, text)], [])
+    found = said(*NONE, sources=sources)
+    drive: Any = SimpleNamespace(steel=None)
+    assert is_right(TrueCause.ELSEWHERE, drive, found, verdict) is right
 
 
 def test_a_vehicle_changes_as_it_is_told() -> None:
@@ -92,7 +111,7 @@ def test_all_changes_take_turns() -> None:
     keys = VALIDATION.keys(OPTIONS)
     cases = [change_of(OPTIONS, key) for key in keys if "case" in key]
     assert len(cases) == 40
-    assert {cases.count(each) for each in TrueCause} == {6, 7}
+    assert {cases.count(each) for each in TrueCause} == {5, 6}
     rest = [change_of(OPTIONS, key) for key in keys if "unchanged" in key]
     assert rest == [TrueCause.NOTHING] * 60
 
