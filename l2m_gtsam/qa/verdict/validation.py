@@ -19,7 +19,6 @@ from l2m_gtsam.records.validation import (
 from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict
 
 SHARED_LIMITS = ("unexplained", "rejected", "outside_map")
-BLIND_TIMES = 2.0  # a change that would fail, so many times over, and would not show
 EXPECTED_TIMES = 2.0  # a refit that leaves no more than this of what is expected fits the map
 NAMES = {
     CalibrationPart.PLACE: "its place t",
@@ -178,19 +177,19 @@ def _counted(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
 
 
 def _blind(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
-    """Return which changes the drive would not have shown."""
+    """Return which changes that would fail the drive need not have shown."""
     limits, named = limits_of(options.validation), {each.part for each in sensor.changes}
     hidden = [
-        f"{NAMES[each.part]} (a change of less than {amount(each.part, each.size)})"
+        f"{NAMES[each.part]} (it shows changes from {amount(each.part, each.size)} on)"
         if np.isfinite(each.size)
-        else f"{NAMES[each.part]} (however it changed)"
+        else f"{NAMES[each.part]} (no change of it shows)"
         for each in sensor.detectable
         if each.part not in (*named, CalibrationPart.CLOCK)
-        and each.size > BLIND_TIMES * limits[each.part].fail
+        and each.size > limits[each.part].fail
     ]
     if not hidden:
         return []
-    text = f"This drive cannot test {', '.join(hidden)}."
+    text = f"This drive cannot rule out a change that fails: {', '.join(hidden)}."
     return [Reason(Level.WARN, text)]
 
 

@@ -15,7 +15,7 @@ from l2m_gtsam.data import Distortion, FieldSample, FloatArray, Recording, Scala
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.qa.fleet import rotations_apart
 from l2m_gtsam.qa.metrics.changes import compare_calibrations
-from l2m_gtsam.qa.options import Limit, QaOptions
+from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions
 from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
 from l2m_gtsam.recording.drive_trace import trace_of
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus, TimeOffset
@@ -37,7 +37,8 @@ from tests.drives.validation import MAP, OPTIONS, calibrated, changed, loops, ot
 from tests.drives.verdict import NOISE, NOMINAL, SENSORS, drive
 from tests.worlds.exact import DipoleWorld, dipole_world
 
-QA = QaOptions()
+# These drives show changes of a place from 31 mm on.
+QA = QaOptions(validation=ValidationOptions(place_m=Limit(warn=0.01, fail=0.04)))
 TURN = Rotation.from_rotvec([0.0, 0.03, 0.05]).as_matrix()
 
 
@@ -327,6 +328,17 @@ def test_a_motor_s_field_is_taken_off() -> None:
         on_drive(recording, calibration)
 
 
+def test_a_change_that_fails_and_would_not_show_is_a_warning() -> None:
+    """A PASS says that none happened: 5 sigmas have to be less than what fails."""
+    verdict = judged(good(), QaOptions())
+    for sensor, known in zip(verdict.sensors, good().sensors, strict=True):
+        (place,) = [each for each in known.detectable if each.part is CalibrationPart.PLACE]
+        limit = QaOptions().validation.place_m.fail
+        assert sensor.level == ("warn" if place.size > limit else "pass")
+    assert level_of(verdict, "mag_1") == "warn"
+    assert "its place t (it shows changes from 31 mm on)" in text_of(verdict, "mag_1")
+
+
 def test_a_vehicle_at_rest_tests_too_little() -> None:
     recording = other_drive()
     poses = recording.trajectory
@@ -344,7 +356,7 @@ def test_a_vehicle_at_rest_tests_too_little() -> None:
     found = validate(parked, STRONG, calibrated(), options, 1e-3)
     verdict = judged(found)
     assert verdict.level == "warn"
-    assert "cannot test its rotation (however it changed)" in text_of(verdict, "mag_0")
+    assert "cannot rule out a change that fails: its" in text_of(verdict, "mag_0")
 
 
 @pytest.mark.parametrize(("less", "more"), [(0.1, 1.0), (1.0, 10.0)])
