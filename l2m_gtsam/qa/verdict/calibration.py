@@ -17,12 +17,17 @@ from l2m_gtsam.records.calibration import (
     Disagreement,
     SensorCalibration,
     SensorStatus,
+    Uncertainty,
 )
 from l2m_gtsam.records.error_budget import DurationSource
 from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
 
 OPEN = (SensorStatus.UNDETERMINED, SensorStatus.NOT_CONVERGED, SensorStatus.NO_READINGS)
+LOWER_BOUNDS = (
+    "Its sigmas are lower bounds: they count errors of the map as each reading's own, though "
+    "readings near each other share them. Use a harmonic map, with `uncertainty: full`."
+)
 MANY = 4  # stretches that are listed one by one
 
 
@@ -168,8 +173,16 @@ def _changed(stretch: Disagreement, result: CalibrationResult) -> str:
     )
 
 
+def _lower_bounds(case: Case) -> list[Reason]:
+    """Return that sigmas do not know how errors of the map are shared, if it has any."""
+    full = case.result.uncertainty is not Uncertainty.INDEPENDENT
+    if full or case.metrics is None or not case.metrics.fit.map_noise:
+        return []
+    return [Reason(Level.WARN, LOWER_BOUNDS)]
+
+
 # In the order in which a person would ask; the worst come first in the end.
-RULES = (repeat, ending, mounting, fit, _own_stretches, clock, precision)
+RULES = (repeat, ending, mounting, fit, _own_stretches, clock, precision, _lower_bounds)
 RULES_OF_A_MISFIT = (fit, ending)
 
 

@@ -184,8 +184,7 @@ def _blind(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
         if np.isfinite(each.size)
         else f"{NAMES[each.part]} (no change of it shows)"
         for each in sensor.detectable
-        if each.part not in (*named, CalibrationPart.CLOCK)
-        and each.size > limits[each.part].fail
+        if each.part not in (*named, CalibrationPart.CLOCK) and each.size > limits[each.part].fail
     ]
     if not hidden:
         return []

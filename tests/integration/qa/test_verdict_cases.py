@@ -15,6 +15,7 @@ from l2m_gtsam.qa.options import Nominal, QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.qa.verdict.repeatability import repeat
 from l2m_gtsam.qa.verdict.sensor import Case
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.bag_options import BagOptions
@@ -162,6 +163,22 @@ def test_the_verdict_is_that_of_a_specialist(name: str) -> None:
 
 def test_what_passes_has_no_reason_to_doubt() -> None:
     assert all(not each.reasons for each in verdict_on(good).sensors)
+
+
+def test_sigmas_that_are_lower_bounds_are_no_pass() -> None:
+    """A map that knows of its errors but not how readings share them, unless it has none."""
+    whole = good()
+    found = calibrated(whole.recording, whole.field_map, whole.options)
+    metrics = evaluate(whole.recording, found, whole.options, QaOptions())
+    assert found.result.uncertainty is Uncertainty.INDEPENDENT
+    first, *others = metrics.sensors
+    noisy = replace(first, fit=replace(first.fit, map_noise=0.02))
+    verdict = judge(found.result, replace(metrics, sensors=(noisy, *others)), QaOptions())
+    assert [each.level for each in verdict.sensors] == [WARN, *[PASS] * len(others)]
+    assert "lower bounds" in verdict.sensors[0].reasons[0].text
+    full = replace(found.result, uncertainty=Uncertainty.FULL)
+    verdict = judge(full, replace(metrics, sensors=(noisy, *others)), QaOptions())
+    assert verdict.level is PASS
 
 
 def test_a_loose_sensor_is_not_blamed_on_the_map() -> None:
