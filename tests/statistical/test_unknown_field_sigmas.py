@@ -1,0 +1,83 @@
+"""Whether sigmas without a map are consistent where odometry errs as it says.
+
+Elsewhere odometry slips: an error that its sigmas hold, but do not describe, so that NEES says
+little. Here every step errs as the graph has it, with no steady drift.
+"""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.progress import silent
+from l2m_gtsam.slam.drive import EXACT_START, Drive, StartPose
+from l2m_gtsam.slam.exploration import solve_field
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.unknown_field.explorer import ExploringOptions
+from tests.drives.drawn import DRIFT, drawn_drive
+from tests.drives.exploring import OnLine
+from tests.drives.slam import laps
+from tests.worlds.exact import dipole_world, random_sensors
+
+DRIVES, SENSORS, SECONDS = 18, 6, 90  # two and a half laps of 21 m
+RATE, EVERY = 5, 2  # poses of 15 cm, every other one a key pose
+EXACT = np.full(15, 1e-6)
+OPTIONS = SlamOptions(drift=DRIFT)
+
+
+@dataclass(frozen=True)
+class DrawnPath:
+    """A drive from an exact start, and its true key poses."""
+
+    drive: Drive
+    truth: list[gtsam.Pose3]
+
+
+def path(seed: int) -> DrawnPath:
+    whole = laps(SECONDS)
+    rows = np.arange(0, len(whole), RATE)
+    poses = whole[rows[: (len(rows) - 1) // EVERY * EVERY + 1]]
+    rng, sensors = np.random.default_rng(1000 + seed), random_sensors(seed, SENSORS)
+    drawn = drawn_drive(dipole_world(seed), sensors, poses, rng, EXACT, every=EVERY)
+    start = StartPose(RigidTransform(drawn.R[0], drawn.p[0]), EXACT_START)
+    truth = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
+    return DrawnPath(replace(drawn.drive, start=start), truth)
+
+
+def nees(poses: list[gtsam.Pose3], covariance: FloatArray, truth: list[gtsam.Pose3]) -> float:
+    """Return the mean over the poses after the first, whose sigmas are those of an exact start."""
+    pairs = zip(poses[1:], covariance[1:], truth[1:], strict=True)
+    errors = [(gtsam.Pose3.Logmap(pose.between(true)), P) for pose, P, true in pairs]
+    return float(np.mean([e @ np.linalg.solve(P, e) for e, P in errors]))
+
+
+def assert_consistent(found: list[float]) -> None:
+    """Assert that the mean over drives is 6 within three of its standard errors."""
+    error = np.std(found, ddof=1) / np.sqrt(len(found))
+    print(f"NEES {np.mean(found):.2f} +- {error:.2f}")
+    assert abs(np.mean(found) - 6) < 3 * error
+
+
+@pytest.mark.study
+def test_on_line_poses_err_as_much_as_they_say() -> None:
+    """NEES is 6 where sigmas are true; a drive counts as one figure. 5.5 +- 0.4 in the first ten."""
+    found = []
+    for seed in range(DRIVES):
+        drawn = path(seed)
+        online = OnLine.over(drawn.drive, drawn.truth, OPTIONS, ExploringOptions())
+        covariance = np.stack([each.pose_covariance for each in online.beliefs])
+        found.append(nees([each.pose for each in online.beliefs], covariance, drawn.truth))
+    assert_consistent(found)
+
+
+@pytest.mark.study
+def test_off_line_poses_err_as_much_as_they_say() -> None:
+    """7.0 +- 0.5, sigmas of 7 cm."""
+    found = []
+    for seed in range(DRIVES):
+        drawn = path(seed)
+        solution = solve_field(drawn.drive, OPTIONS, silent).solution
+        found.append(nees(solution.poses, solution.pose_covariance, drawn.truth))
+    assert_consistent(found)
