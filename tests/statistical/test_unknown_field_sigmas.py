@@ -62,7 +62,7 @@ def assert_consistent(found: list[float]) -> None:
 
 @pytest.mark.study
 def test_on_line_poses_err_as_much_as_they_say() -> None:
-    """NEES is 6 where sigmas are true; a drive counts as one figure. 5.5 +- 0.4 in the first ten."""
+    """NEES is 6 where sigmas are true; a drive is one figure. 5.5 +- 0.4 in the first ten."""
     found = []
     for seed in range(DRIVES):
         drawn = path(seed)
