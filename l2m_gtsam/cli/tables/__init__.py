@@ -1,11 +1,16 @@
 """Results as tables and lines in the terminal."""
 
 from collections.abc import Sequence
+from math import isfinite
 
 from rich import box
 from rich.table import Table
 
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.text.rounded import by_sigma, sigma_alone
+
 TEXT_WIDTH = 18  # the least of a column of text that breaks where it must
+OPEN = "-"  # what is not determined
 COLOURS = {"pass": "green", "warn": "yellow", "fail": "red"}
 
 
@@ -43,6 +48,18 @@ def add_numbers(table: Table, headings: Sequence[str]) -> None:
 def add_text(table: Table, heading: str, width: int = TEXT_WIDTH) -> None:
     """Add a column of text, of this width at least."""
     table.add_column(heading, overflow="fold", min_width=width)
+
+
+def vector_cell(values: FloatArray, sigmas: FloatArray, width: int = 0) -> str:
+    """Return a vector, each entry by its standard deviation; a dash for what is not determined."""
+    pairs = zip(values.tolist(), sigmas.tolist(), strict=True)
+    each = (by_sigma(v, s) if isfinite(v) and isfinite(s) else OPEN for v, s in pairs)
+    return " ".join(f"{text:>{width}}" for text in each)
+
+
+def sigmas_cell(sigmas: FloatArray) -> str:
+    """Return standard deviations; a dash for what is not determined."""
+    return " ".join(sigma_alone(each) if isfinite(each) else OPEN for each in sigmas.tolist())
 
 
 def coloured(level: str) -> str:

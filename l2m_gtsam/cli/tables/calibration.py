@@ -4,8 +4,8 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.cli.tables import add_numbers, new_table, plain_table
-from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.cli.tables import add_numbers, new_table, plain_table, sigmas_cell, vector_cell
+from l2m_gtsam.data import KnownSensor
 from l2m_gtsam.qa.verdict.places import stretch_head
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
@@ -15,6 +15,7 @@ from l2m_gtsam.records.calibration import (
     TimeOffset,
 )
 from l2m_gtsam.records.sensor_models import Model, ModelComparison, ModelFigures, MovingField
+from l2m_gtsam.text.rounded import significant, with_sigma
 
 HEADINGS = (
     "t_lidar_mag (m)",
@@ -30,8 +31,7 @@ HEADINGS = (
     "outside map",
     "|C - R| max",
 )
-PLACES = {1: 4, 2: 6, 3: 6}
-"""Of a number with so many digits behind the point: millimetres, microtesla, metres."""
+WIDTH = 7  # of a coordinate: rows are below each other
 MODEL_HEADINGS = (
     "score",
     "behind the best",
@@ -65,12 +65,12 @@ def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
     return (
         name,
         status,
-        _vector(sensor.t_lidar_mag, 3),
-        _vector(1e3 * sensor.t_sigma, 1),
-        _vector(distortion.H, 2),
-        " ".join(f"{each:.2f}" for each in sensor.H_sigma),
-        f"{angle:.2f}",
-        " ".join(f"{each:.2f}" for each in turned),
+        vector_cell(sensor.t_lidar_mag, sensor.t_sigma, WIDTH),
+        sigmas_cell(1e3 * sensor.t_sigma),
+        vector_cell(distortion.H, sensor.H_sigma, WIDTH),
+        sigmas_cell(sensor.H_sigma),
+        vector_cell(np.array([angle]), turned.max(keepdims=True)),
+        sigmas_cell(turned),
         _clock(sensor.time_offset),
         f"{sensor.residuals.rms:.3f}",
         f"{sensor.residuals.readings:,}",
@@ -95,11 +95,7 @@ def _clock(offset: TimeOffset | None) -> str:
     """Return a time offset in milliseconds with its sigma; a dash where it is held at zero."""
     if offset is None or not offset.estimated:
         return "-"
-    return f"{1e3 * offset.seconds:.2f} ± {1e3 * offset.sigma:.2f}"
-
-
-def _vector(values: FloatArray, digits: int) -> str:
-    return " ".join(f"{value:{PLACES[digits]}.{digits}f}" for value in values)
+    return with_sigma(1e3 * offset.seconds, 1e3 * offset.sigma)
 
 
 def _status(sensor: SensorCalibration) -> str:
@@ -117,7 +113,7 @@ def disagreement_note(stretch: Disagreement) -> str:
         f"distortion and do not count, {1e-9 * stretch.start_ns:.2f} to "
         f"{1e-9 * stretch.end_ns:.2f} s, "
         f"{stretch.length:.1f} m from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m, "
-        f"{stretch.size:.2g} uT off; {head[:1].lower()}{head[1:]}"
+        f"{significant(stretch.size, 2)} uT off; {head[:1].lower()}{head[1:]}"
     )
 
 
@@ -156,22 +152,27 @@ def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Ta
 
 
 def _truth_row(known: KnownSensor, sensor: SensorCalibration) -> tuple[str, ...]:
-    name, true = escape(known.sensor), _vector(known.t_lidar_mag, 3)
+    name = escape(known.sensor)
     if sensor.residuals is None:
+        true = " ".join(f"{each:.3f}" for each in known.t_lidar_mag)
         return (name, _status(sensor), *("-",) * 5, true, "-")
     C_error = np.linalg.norm(sensor.distortion.C - known.distortion.C)
     H_error = np.linalg.norm(sensor.distortion.H - known.distortion.H)
     return (
         name,
-        _vector(1e3 * (sensor.t_lidar_mag - known.t_lidar_mag), 1),
-        _vector(1e3 * sensor.t_sigma, 1),
-        f"{H_error:.3f}",
-        f"{np.linalg.norm(sensor.H_sigma):.3f}",
-        f"{C_error:.4f}",
-        f"{np.linalg.norm(sensor.C_sigma):.4f}",
-        true,
-        _vector(sensor.t_lidar_mag, 3),
+        vector_cell(1e3 * (sensor.t_lidar_mag - known.t_lidar_mag), 1e3 * sensor.t_sigma),
+        sigmas_cell(1e3 * sensor.t_sigma),
+        *_length(H_error, np.linalg.norm(sensor.H_sigma)),
+        *_length(C_error, np.linalg.norm(sensor.C_sigma)),
+        vector_cell(known.t_lidar_mag, sensor.t_sigma),
+        vector_cell(sensor.t_lidar_mag, sensor.t_sigma),
     )
+
+
+def _length(error: np.floating, sigma: np.floating) -> tuple[str, str]:
+    """Return the length of an error and its standard deviation as two cells."""
+    size = np.array([sigma])
+    return vector_cell(np.array([error]), size), sigmas_cell(size)
 
 
 def consistency_note(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> str:
@@ -216,8 +217,8 @@ def model_table(sensor: str, comparison: ModelComparison) -> Table:
 def _model_row(fit: ModelFigures) -> tuple[str, ...]:
     return (
         fit.model.value,
-        f"{fit.held_out_score:.3f} ± {fit.score_error:.3f}",
-        f"{fit.behind:.3f} ± {fit.behind_error:.3f}",
+        with_sigma(fit.held_out_score, fit.score_error),
+        with_sigma(fit.behind, fit.behind_error),
         f"{fit.rms:.3f}",
         f"{fit.held_out_rms:.3f}",
         str(fit.parameters),
@@ -236,4 +237,4 @@ def model_note(sensor: SensorCalibration) -> str:
 
 def _moving(found: MovingField) -> str:
     each = zip(found.h.tolist(), found.sigma.tolist(), strict=True)
-    return f"{found.name}: " + ", ".join(f"{h:.3g} ± {sigma:.1g}" for h, sigma in each) + " uT each"
+    return f"{found.name}: {', '.join(with_sigma(h, sigma) for h, sigma in each)} uT each"

@@ -6,14 +6,13 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.cli.tables import add_numbers, add_text, new_table, plain_table
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.cli.tables import add_numbers, add_text, new_table, plain_table, sigmas_cell
 from l2m_gtsam.records.plan import DrivePlan, SensorPlan, Worst
 from l2m_gtsam.storage.bag_report import BagReport, TopicReport
+from l2m_gtsam.text.rounded import in_unit, sigma_alone
 
 HEADINGS = ("± t (mm)", "± H (uT)", "± rotation (deg)", "± clock (ms)")
 OTHERS = ("± C by column", "assumed t (m)", "readings", "outside map")
-OPEN = "-"  # for a sigma that nothing bounds
 UNITS = {"t": (1e3, "mm"), "C": (1.0, ""), "H": (1.0, "uT")}
 
 
@@ -72,7 +71,7 @@ def _worst_cells(worst: Worst) -> tuple[str, str, str]:
     if not worst.parameter:
         return str(worst.undetermined), "", ""
     factor, unit = UNITS[worst.parameter[0]]
-    sigma = f"{factor * worst.sigma:.2g} {unit}".strip()
+    sigma = in_unit(sigma_alone(factor * worst.sigma), unit)
     return str(worst.undetermined), worst.parameter, sigma
 
 
@@ -82,20 +81,16 @@ def _sensor_row(sensor: SensorPlan) -> tuple[str, ...]:
     place = " ".join(f"{value:.3f}" for value in sensor.t_lidar_mag)
     return (
         escape(sensor.sensor),
-        _sigmas(1e3 * sigma[:3]),
-        _sigmas(sigma[12:]),
-        _sigmas(np.degrees(np.sqrt(np.diag(sensor.rotation_covariance)))),
+        sigmas_cell(1e3 * sigma[:3]),
+        sigmas_cell(sigma[12:]),
+        sigmas_cell(np.degrees(np.sqrt(np.diag(sensor.rotation_covariance)))),
         escape(". ".join([*sensor.undetermined, *priors])),
-        _sigmas(np.array([1e3 * sensor.offset_sigma])),
-        _sigmas(sigma[3:12].reshape(3, 3).max(axis=0)),
+        sigmas_cell(np.array([1e3 * sensor.offset_sigma])),
+        sigmas_cell(sigma[3:12].reshape(3, 3).max(axis=0)),
         place,
         f"{sensor.readings:,}",
         f"{sensor.outside_map:,}",
     )
-
-
-def _sigmas(values: FloatArray) -> str:
-    return " ".join(f"{value:.2g}" if np.isfinite(value) else OPEN for value in values)
 
 
 def bag_table(report: BagReport) -> Table:

@@ -7,9 +7,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from l2m_gtsam.batch.maps import MapDescription
-from l2m_gtsam.cli.tables import add_numbers, add_text, plain_table
+from l2m_gtsam.cli.tables import add_numbers, add_text, plain_table, vector_cell
 from l2m_gtsam.maps.compare import KindFigures, KindResult, MapComparison
 from l2m_gtsam.records.map_diary import MapDiary, between, doubtful, words_of
+from l2m_gtsam.text.rounded import by_sigma, sigma_alone
 
 HEADINGS = (
     "log-likelihood",
@@ -119,13 +120,15 @@ def changes_table(diary: MapDiary) -> Table:
     add_numbers(table, CHANGE_HEADINGS)
     for number in reversed(range(len(diary.changes))):
         source = diary.changes[number].source
+        position = float(np.max(source.position_sigma))
+        moment = float(np.linalg.norm(source.moment_sigma))
         table.add_row(
             f"{number + 1} {words_of(diary, number)}",
             between(diary, number),
-            " ".join(f"{value:.2f}" for value in source.position),
-            f"{float(np.max(source.position_sigma)):.2f}",
-            f"{float(np.linalg.norm(source.moment)):.1f}",
-            f"{float(np.linalg.norm(source.moment_sigma)):.1f}",
+            vector_cell(source.position, np.full(3, position)),
+            sigma_alone(position),
+            by_sigma(float(np.linalg.norm(source.moment)), moment),
+            sigma_alone(moment),
             f"{source.strongest:.1f}",
         )
     return table

@@ -8,6 +8,7 @@ from l2m_gtsam.batch.online_slam import OnlineOutcome
 from l2m_gtsam.cli.tables import new_table
 from l2m_gtsam.records.localisation import Gain, LocalisationResult, ScanUse, StartSearch
 from l2m_gtsam.records.localisation_file import TruthRecord
+from l2m_gtsam.text.rounded import significant
 
 MOST_EVENTS = 20  # that are printed
 
@@ -19,7 +20,7 @@ def slam_table(result: LocalisationResult) -> Table:
     for each in result.sensors:
         table.add_row(
             escape(each.sensor),
-            f"{each.rms:.3g}",
+            significant(each.rms),
             f"{each.chi2_per_dof:.2f}",
             str(each.readings),
             str(each.rejected),

@@ -13,6 +13,7 @@ from l2m_gtsam.records.validation import (
     ValidatedSensor,
 )
 from l2m_gtsam.records.verdict import Verdict
+from l2m_gtsam.text.rounded import significant, with_sigma
 
 
 def validation_table(drive: DriveValidation, verdict: Verdict) -> Table:
@@ -39,8 +40,8 @@ def validation_table(drive: DriveValidation, verdict: Verdict) -> Table:
 def _figures(sensor: ValidatedSensor) -> tuple[str, ...]:
     nis = sensor.nis
     return (
-        f"{sensor.before.squared:.3g}",
-        f"{sensor.after.squared:.3g}",
+        significant(sensor.before.squared),
+        significant(sensor.after.squared),
         f"{nis.ratio:.2f} ({nis.low / nis.freedom:.2f} - {nis.high / nis.freedom:.2f})",
         f"{sensor.readings:,}",
         f"{sensor.rejected:,}",
@@ -77,16 +78,14 @@ def _comparison_row(sensor: ComparedSensor) -> tuple[str, ...]:
     return (
         escape(sensor.sensor),
         *(_test(sensor, name) for name in names),
-        _with_sigmas(1e3 * d[:3], 1e3 * sigma[:3], 1),
-        _with_sigmas(d[12:], sigma[12:], 2),
+        _with_sigmas(1e3 * d[:3], 1e3 * sigma[:3]),
+        _with_sigmas(d[12:], sigma[12:]),
     )
 
 
-def _with_sigmas(values: np.ndarray, sigmas: np.ndarray, digits: int) -> str:
+def _with_sigmas(values: np.ndarray, sigmas: np.ndarray) -> str:
     pairs = zip(values, sigmas, strict=True)
-    return "  ".join(
-        f"{v:.{digits}f} ± {s:.{digits}f}" if np.isfinite(s) else "unknown" for v, s in pairs
-    )
+    return "  ".join(with_sigma(v, s) for v, s in pairs)
 
 
 def _test(sensor: ComparedSensor, name: str) -> str:

@@ -18,10 +18,10 @@ from l2m_gtsam.qa.report.figures import readings, statistics
 from l2m_gtsam.qa.report.figures.changes import changes_figure
 from l2m_gtsam.qa.report.figures.comparison import drives_figure
 from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
-from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw
+from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw, roll_pitch_yaw_sigma
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.calibration import Measured, judge, measured
-from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, stretch_head
+from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, place_of, stretch_head
 from l2m_gtsam.qa.verdict.uncertainty import shares_in_words, what_helps
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import Metrics, SensorMetrics
@@ -65,6 +65,12 @@ class SensorSection:
     def turn_sigma_deg(self) -> FloatArray:
         """Standard deviations of the rotation about the sensor's axes in degrees, shape (3,)."""
         return np.asarray(np.rad2deg(np.sqrt(np.diag(self.sensor.rotation_covariance))))
+
+    @property
+    def roll_pitch_yaw_sigma(self) -> FloatArray:
+        """Standard deviations of these angles in degrees, shape (3,)."""
+        turn = Rotation.from_matrix(self.sensor.R_lidar_mag)
+        return roll_pitch_yaw_sigma(turn, self.sensor.rotation_covariance)
 
 
 def calibration_page(
@@ -119,6 +125,7 @@ def calibration_page(
             length=np.linalg.norm,
             what_else=best_of,
             cause=cause_in_short,
+            place=place_of,
             cause_of_stretch=stretch_head,
             shares=shares_in_words,
             what_helps=what_helps,

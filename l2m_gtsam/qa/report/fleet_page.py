@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.qa.fleet import verdict_histories
 from l2m_gtsam.qa.options import FleetOptions
 from l2m_gtsam.qa.report.figures.trends import SIGMAS, Trend, trend_figure, trends
-from l2m_gtsam.qa.report.page import Picture, own_file, render, roll_pitch_yaw, with_sigma
+from l2m_gtsam.qa.report.page import Picture, own_file, render, roll_pitch_yaw
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.records.fleet import ERROR, FleetRow, SensorRow
+from l2m_gtsam.text.rounded import by_sigma, sigma_alone, with_sigma
 
 REPORT = "report.html"  # in the folder of each drive
 
@@ -122,7 +123,7 @@ def _small(svg: Markup) -> Markup:
 def _coordinates(sensor: SensorRow) -> list[tuple[str, str]]:
     """Return x, y and z in millimetres as a cell sorts, and as it reads."""
     pairs = zip(sensor.t, sensor.t_sigma, strict=True)
-    return [(f"{1e3 * value:.3f}", with_sigma(1e3 * value, 1e3 * s, 1)) for value, s in pairs]
+    return [(f"{1e3 * value:.3f}", with_sigma(1e3 * value, 1e3 * s)) for value, s in pairs]
 
 
 def _turned(sensor: SensorRow) -> str:
@@ -131,8 +132,10 @@ def _turned(sensor: SensorRow) -> str:
         return "–"
     roll, pitch, yaw = roll_pitch_yaw(Rotation.from_quat(sensor.quaternion_xyzw))
     sigma = max(sensor.rotation_sigma)
-    known = f" ± {sigma:.2f}" if np.isfinite(sigma) else ", part of it not determined"
-    return f"{roll:.1f}, {pitch:.1f}, {yaw:.1f}{known}"
+    if not np.isfinite(sigma):
+        return f"{roll:.1f}, {pitch:.1f}, {yaw:.1f}, part of it not determined"
+    angles = ", ".join(by_sigma(each, sigma) for each in (roll, pitch, yaw))
+    return f"{angles} ± {sigma_alone(sigma)}"
 
 
 def _link(row: FleetRow) -> str:

@@ -16,7 +16,18 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.svg import as_svg
 from l2m_gtsam.records.metrics import Row
+from l2m_gtsam.text.rounded import (
+    by_sigma,
+    limit,
+    sigma_alone,
+    significant,
+    vector_by_sigma,
+    vector_of_sigmas,
+    with_sigma,
+)
 from l2m_gtsam.text.shown import shown_lines
+
+TURN = 1e-5  # rad, of central differences
 
 
 @dataclass(frozen=True)
@@ -37,22 +48,10 @@ def pictures(figures: Mapping[str, Figure | Drawing], anchor: str = "") -> dict[
     return {key: Picture(f"{start}{key}", figure) for key, figure in figures.items()}
 
 
-def number(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits; a dash where it is none or infinite."""
-    return f"{value:.{digits}g}" if np.isfinite(value) else "–"
-
-
 def fixed(values: float | Row, digits: int) -> str:
     """Return one number or several with so many digits behind the point."""
     each = values if isinstance(values, tuple) else (values,)
     return ", ".join(f"{value:.{digits}f}" for value in each)
-
-
-def with_sigma(value: float, sigma: float, digits: int) -> str:
-    """Return a value with its standard deviation; "not determined" where that is infinite."""
-    if not np.isfinite(sigma) or not np.isfinite(value):
-        return "not determined"
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
 
 
 def vector(values: FloatArray, digits: int) -> str:
@@ -76,6 +75,28 @@ def roll_pitch_yaw(turn: Rotation) -> tuple[float, float, float]:
     """Return the angles of a rotation in degrees, as ROS names them (REP 103)."""
     yaw, pitch, roll = turn.as_euler("ZYX", degrees=True)  # intrinsic z, y, x
     return roll, pitch, yaw
+
+
+def roll_pitch_yaw_sigma(turn: Rotation, covariance: FloatArray) -> FloatArray:
+    """Return standard deviations of these angles in degrees, shape (3,).
+
+    Parameters
+    ----------
+    turn
+        ``R_lidar_mag``.
+    covariance
+        Of its error in the sensor frame in rad^2, shape (3, 3); infinite where it is open.
+    """
+    if not np.isfinite(covariance).all():
+        return np.full(3, np.inf)
+    moved = [
+        roll_pitch_yaw(turn * Rotation.from_rotvec(TURN * axis))
+        for axis in (*np.eye(3), *-np.eye(3))
+    ]
+    ahead, behind = np.deg2rad(moved[:3]), np.deg2rad(moved[3:])
+    # an angle may pass from pi to -pi in between
+    J = ((ahead - behind + np.pi) % (2 * np.pi) - np.pi).T / (2 * TURN)
+    return np.asarray(np.rad2deg(np.sqrt(np.diag(J @ covariance @ J.T))))
 
 
 def render(template: str, **values: Any) -> str:
@@ -113,9 +134,14 @@ def _environment() -> Environment:
     environment.tests["finite"] = math.isfinite
     environment.filters |= {
         "code": code,
-        "number": number,
+        "number": significant,
+        "limit": limit,
         "fixed": fixed,
         "vector": vector,
+        "by_sigma": by_sigma,
+        "sigma": sigma_alone,
+        "sigmas": vector_of_sigmas,
         "with_sigma": with_sigma,
+        "vector_by_sigma": vector_by_sigma,
     }
     return environment

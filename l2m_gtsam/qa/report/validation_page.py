@@ -14,7 +14,7 @@ from l2m_gtsam.qa.report.figures.comparison import field_errors_figure, nis_figu
 from l2m_gtsam.qa.report.figures.statistics import sigmas_figure
 from l2m_gtsam.qa.report.page import Picture, pictures, render
 from l2m_gtsam.qa.report.svg import SETTINGS
-from l2m_gtsam.qa.verdict.places import best_of, cause_in_short
+from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, place_of
 from l2m_gtsam.qa.verdict.validation import NAMES, amount
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.validation import (
@@ -70,6 +70,7 @@ def validation_page(found: Validation) -> str:
             length=np.linalg.norm,
             what_else=best_of,
             cause=cause_in_short,
+            place=place_of,
         )
 
 

@@ -22,6 +22,7 @@ from l2m_gtsam.records.calibration import (
 from l2m_gtsam.records.error_budget import DurationSource
 from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
+from l2m_gtsam.text.rounded import significant
 
 OPEN = (SensorStatus.UNDETERMINED, SensorStatus.NOT_CONVERGED, SensorStatus.NO_READINGS)
 LOWER_BOUNDS = (
@@ -85,7 +86,7 @@ def _exact(result: CalibrationResult) -> list[Reason]:
     """Return what the sigmas know no errors of, and what they have from the readings alone."""
     reasons = []
     if (lasting := result.pose_duration) and lasting.source is DurationSource.FOUND:
-        text = f"Errors of poses last {lasting.seconds:.2g} s, by the readings."
+        text = f"Errors of poses last {significant(lasting.seconds, 2)} s, by the readings."
         reasons.append(Reason(Level.PASS, text))
     if size := result.unseen_warp_m:
         text = (
@@ -168,7 +169,7 @@ def _changed(stretch: Disagreement, result: CalibrationResult) -> str:
         f"{stretch_head(stretch)}: from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m on "
         f"the map{drive}{when}, {stretch.length:.1f} m long, "
         f"{count} sensor{'s' if count > 1 else ''} differ{'' if count > 1 else 's'} by "
-        f"{stretch.size:.2g} µT. "
+        f"{significant(stretch.size, 2)} µT. "
         f"{stretch_tail(stretch)}. These {stretch.readings} readings do not count."
     )
 

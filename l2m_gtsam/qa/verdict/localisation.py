@@ -18,6 +18,7 @@ from l2m_gtsam.records.localisation_file import (
 )
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Threshold, Verdict
 from l2m_gtsam.solve.chi_square import chance_beyond
+from l2m_gtsam.text.rounded import with_sigma
 
 SHARED_LIMITS = ("rejected", "outside_map", "chi_square")
 MANY = 3  # stretches that are listed one by one
@@ -255,7 +256,7 @@ def _drift(record: LocalisationRecord) -> Reason:
 
 def _scale(scale: OdometryScale) -> Reason:
     text = (
-        f"Distances are {abs(scale.longer):.2%} ± {scale.sigma:.2%} (1 sigma) "
+        f"Distances are {with_sigma(100 * abs(scale.longer), 100 * scale.sigma, '%')} (1 sigma) "
         f"{'longer' if scale.longer >= 0 else 'shorter'} than odometry's."
     )
     return Reason(Level.PASS, text)

@@ -5,6 +5,7 @@ import numpy as np
 from l2m_gtsam.records.calibration import Disagreement, Return
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
 from l2m_gtsam.records.verdict import Level, Reason
+from l2m_gtsam.text.rounded import sigma_alone, significant, vector_by_sigma, with_sigma
 
 CAUSES = {
     Cause.PLACE: "the place changed",
@@ -31,16 +32,21 @@ def cause_in_short(source: ChangedSource) -> str:
     return f"{SHORT[best.cause]} or {SHORT[others[0].cause]}"
 
 
+def place_of(source: ChangedSource) -> str:
+    """Return where the change is in metres, with one standard deviation over all axes."""
+    spread = float(np.linalg.norm(source.position_sigma))
+    return f"{vector_by_sigma(source.position, (spread,) * 3)} ± {sigma_alone(spread)}"
+
+
 def source_sentence(number: int, source: ChangedSource) -> str:
     """Return where steel came, went or was moved, how large it is, and what else it may be."""
-    x, y, z = np.round(source.position, 1) + 0.0  # never minus zero
-    spread = float(np.linalg.norm(source.position_sigma))
-    moment, sigma = np.linalg.norm(source.moment), np.linalg.norm(source.moment_sigma)
+    moment = float(np.linalg.norm(source.moment))
+    sigma = float(np.linalg.norm(source.moment_sigma))
     length = f", {source.length_m:.1f} m long" if source.length_m else ""
     sentence = (
         f"Steel {number} came, went or was moved since the map was surveyed: at "
-        f"({x:.1f}, {y:.1f}, {z:.1f}) ± {spread:.2f} m{length}, {moment:.2g} ± {sigma:.1g} A m², "
-        f"up to {source.strongest:.2g} µT at the readings. It is taken into account."
+        f"{place_of(source)} m{length}, {with_sigma(moment, sigma, 'A m²')}, "
+        f"up to {significant(source.strongest, 2)} µT at the readings. It is taken into account."
     )
     return sentence if source.cause is Cause.PLACE else f"{sentence} {cause_sentence(source)}"
 

@@ -15,6 +15,7 @@ from l2m_gtsam.records.calibration import (
 )
 from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Level, Reason
+from l2m_gtsam.text.rounded import by_sigma, sigma_alone, significant
 
 HEADS = {
     SensorStatus.NOT_CONVERGED: "The solve did not converge",
@@ -143,8 +144,8 @@ def _explained(case: Case) -> list[Reason]:
         return []
     found = case.metrics.fit
     text = (
-        f"The map leaves {found.left:.2g} µT of its readings unexplained, a field that is the same "
-        f"everywhere {found.without_map:.2g} µT: "
+        f"The map leaves {significant(found.left, 2)} µT of its readings unexplained, a field that "
+        f"is the same everywhere {significant(found.without_map, 2)} µT: "
     )
     if found.unexplained > case.options.unexplained.fail:
         text += (
@@ -172,8 +173,9 @@ def clock(case: Case) -> list[Reason]:
     offset, limit = case.sensor.time_offset, case.options.time_offset_s
     if offset is None or not offset.estimated or abs(offset.seconds) < 3 * offset.sigma:
         return []
+    ms, sigma_ms = 1e3 * offset.seconds, 1e3 * offset.sigma
     text = (
-        f"Its clock is off by {1e3 * offset.seconds:.1f} ± {1e3 * offset.sigma:.1f} ms against the "
+        f"Its clock is off by {by_sigma(ms, sigma_ms)} ± {sigma_alone(sigma_ms)} ms against the "
         "lidar's. That is taken into account here; correct its stamps before its readings are used."
     )
     size = abs(offset.seconds)
@@ -185,12 +187,13 @@ def precision(case: Case) -> list[Reason]:
     sensor, options = case.sensor, case.options
     t, H = _largest(sensor.t_sigma), _largest(sensor.H_sigma)
     angle = np.rad2deg(_largest(np.sqrt(np.diag(sensor.rotation_covariance))))
-    place = f"Its place is only known to ± {1e3 * t:.1f} mm (1 sigma)."
-    rotation = f"Its rotation is only known to ± {angle:.1f}°."
+    place = f"Its place is only known to ± {sigma_alone(1e3 * t)} mm (1 sigma)."
+    offset = f"Its offset H is only known to ± {sigma_alone(H)} µT."
+    rotation = f"Its rotation is only known to ± {sigma_alone(angle)}°."
     return [
         *options.position_sigma_m.reasons(t, place),
         *options.rotation_sigma_deg.reasons(angle, rotation),
-        *options.hard_iron_sigma_ut.reasons(H, f"Its offset H is only known to ± {H:.2g} µT."),
+        *options.hard_iron_sigma_ut.reasons(H, offset),
         *(_unmodelled(case) or _correlated(case)),
         *(
             Reason(Level.PASS, f"Not from this drive but from what was known beforehand: {each}.")

@@ -17,6 +17,7 @@ from l2m_gtsam.records.validation import (
     ValidatedSensor,
 )
 from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict
+from l2m_gtsam.text.rounded import in_unit, significant, with_sigma
 
 SHARED_LIMITS = ("unexplained", "rejected", "outside_map")
 EXPECTED_TIMES = 2.0  # a refit that leaves no more than this of what is expected fits the map
@@ -28,14 +29,14 @@ NAMES = {
     CalibrationPart.OFFSET: "its offset H",
     CalibrationPart.CLOCK: "its clock",
 }
-# Factor from the units of ``CalibrationChange``, unit, digits of its parts, and their axes.
+# Factor from the units of ``CalibrationChange``, unit, and axes of its parts.
 SHOWN = {
-    CalibrationPart.PLACE: (1e3, "mm", 1, " along the lidar's x, y, z"),
-    CalibrationPart.ROTATION: (1.0, "°", 2, " about its own x, y, z"),
-    CalibrationPart.GAINS: (1e2, "%", 2, " of its x, y, z"),
-    CalibrationPart.ANGLES: (1.0, "°", 2, " less between x y, y z, z x"),
-    CalibrationPart.OFFSET: (1.0, "µT", 2, " along its x, y, z"),
-    CalibrationPart.CLOCK: (1e3, "ms", 1, ""),
+    CalibrationPart.PLACE: (1e3, "mm", " along the lidar's x, y, z"),
+    CalibrationPart.ROTATION: (1.0, "°", " about its own x, y, z"),
+    CalibrationPart.GAINS: (1e2, "%", " of its x, y, z"),
+    CalibrationPart.ANGLES: (1.0, "°", " less between x y, y z, z x"),
+    CalibrationPart.OFFSET: (1.0, "µT", " along its x, y, z"),
+    CalibrationPart.CLOCK: (1e3, "ms", ""),
 }
 MEANINGS = {
     CalibrationPart.PLACE: "it was moved, or its mount gave way",
@@ -114,9 +115,9 @@ def _misfit(sensor: ValidatedSensor, options: QaOptions) -> bool:
 def _on_sensor(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     if _misfit(sensor, options):
         text = (
-            f"Whatever C and H are, the map leaves {sensor.refitted:.2g} µT of its readings, a "
-            f"field that is the same everywhere {sensor.uniform:.2g} µT: the map does not fit what "
-            "it reads here."
+            f"Whatever C and H are, the map leaves {significant(sensor.refitted, 2)} µT of its "
+            f"readings, a field that is the same everywhere {significant(sensor.uniform, 2)} µT: "
+            "the map does not fit what it reads here."
         )
         return [Reason(Level.FAIL, text)]
     rules: tuple[Callable[[ValidatedSensor, QaOptions], list[Reason]], ...] = (
@@ -232,22 +233,17 @@ def limits_of(options: ValidationOptions) -> dict[CalibrationPart, Limit]:
 
 def amount(part: CalibrationPart, size: float) -> str:
     """Return a size with its unit."""
-    factor, unit, _, _ = SHOWN[part]
-    value = factor * size
-    number = f"{value:.2g}" if value < 10 else f"{value:.0f}"
-    return f"{number}{'' if unit == '°' else ' '}{unit}"
+    factor, unit, _ = SHOWN[part]
+    return in_unit(significant(factor * size, 2), unit)
 
 
 def by_how_much(change: CalibrationChange) -> str:
     """Return size, parts and sigmas of a change."""
-    factor, unit, digits, along = SHOWN[change.part]
-    space = "" if unit == "°" else " "
+    factor, unit, along = SHOWN[change.part]
     parts = ", ".join(
-        f"{factor * value:.{digits}f} ± {factor * sigma:.{digits}f}"
-        if np.isfinite(value) and np.isfinite(sigma)
-        else "unknown"
+        with_sigma(factor * value, factor * sigma)
         for value, sigma in zip(change.change, change.sigma, strict=True)
     )
     if len(change.change) == 1:
-        return f"{parts}{space}{unit}"
-    return f"{amount(change.part, change.size)}: ({parts}){space}{unit}{along}"
+        return in_unit(parts, unit)
+    return f"{amount(change.part, change.size)}: {in_unit(f'({parts})', unit)}{along}"

@@ -41,8 +41,9 @@ FIRST, SECOND = source(1.0, 0.4, PLACE), source(-1.5, 0.01, PLACE, VEHICLE)
 
 def test_a_sentence_tells_where_and_how_much() -> None:
     assert source_sentence(1, FIRST) == (
-        "Steel 1 came, went or was moved since the map was surveyed: at (1.0, 0.0, 0.5) ± 0.05 m, "
-        "0.8 m long, 12 ± 3 A m², up to 4.7 µT at the readings. It is taken into account."
+        "Steel 1 came, went or was moved since the map was surveyed: at (1.000, -0.010, 0.500) "
+        "± 0.050 m, 0.8 m long, 12.0 ± 3.0 A m², up to 4.7 µT at the readings. It is taken into "
+        "account."
     )
 
 
@@ -119,7 +120,7 @@ def test_the_page_shows_what_changed_where() -> None:
     assert page.index('id="changes"') < page.index("Where the sensors are")
     (picture,) = re.findall(r'aria-label="Steel that came, went or was moved: ([^"]*)"', page)
     assert picture == "1 at (1.0, 0.0, 0.5) m, 2 at (-1.5, 0.0, 0.5) m."
-    assert "12 ± 3" in page
+    assert "12.0 ± 3.0" in page
     assert "Steel 2 came, went or was moved" in page
     # And a page without changes does not speak of them.
     assert "changes" not in re.findall(r'id="([^"]*)"', plain)

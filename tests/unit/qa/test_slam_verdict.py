@@ -209,11 +209,11 @@ def test_thresholds_are_those_of_the_options() -> None:
 def test_a_scale_that_was_found_is_reported() -> None:
     """As what ways are; where it is no variable nothing is said of it."""
     shorter = replace(good(), scale=OdometryScale(-0.0111, 0.0018))
-    told = "Distances are 1.11% ± 0.18% (1 sigma) shorter than odometry's."
+    told = "Distances are 1.11 ± 0.18% (1 sigma) shorter than odometry's."
     assert told in texts(judged(shorter), Level.PASS)
     longer = replace(good(), scale=OdometryScale(0.02, 0.001))
     assert any(
-        "2.00% ± 0.10% (1 sigma) longer" in each for each in texts(judged(longer), Level.PASS)
+        "2.00 ± 0.10% (1 sigma) longer" in each for each in texts(judged(longer), Level.PASS)
     )
     assert not any("Distances are" in each for each in texts(judged(good()), Level.PASS))
 

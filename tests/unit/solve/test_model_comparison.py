@@ -26,6 +26,7 @@ from l2m_gtsam.solve.model_comparison import (
     segments_of,
 )
 from l2m_gtsam.solve.model_fits import Fit, Solution, Spread, compress, fit_model
+from l2m_gtsam.text.rounded import with_sigma
 from tests.drives.model import NOISE, Setting, drawn
 
 NOTHING = Coefficients(np.zeros((3, 3)), np.zeros(3), np.zeros((0, 3)), np.zeros((3, 3)))
@@ -231,5 +232,5 @@ def test_the_table_shows_every_model_and_the_recommended_one() -> None:
     text = console.export_text()
     assert "Models of front[1]/mag, amp: 400 readings that count as" in text
     for fit in comparison.fits:
-        assert f"{fit.held_out_score:.3f} ± {fit.score_error:.3f}" in text
+        assert with_sigma(fit.held_out_score, fit.score_error) in text
     assert "recommended: full + regressors; full + regressors predicts" in " ".join(text.split())

@@ -24,6 +24,7 @@ from l2m_gtsam.qa.report.svg import (
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.metrics import Repeatability
 from l2m_gtsam.records.validation import ValidatedSensor
+from l2m_gtsam.text.rounded import with_sigma
 
 MANY = 12  # drives beyond which only some are numbered
 ROW = 0.26  # inches of a sensor
@@ -58,8 +59,13 @@ def drives_figure(sensor: SensorCalibration, found: Repeatability) -> Figure:
         strict=True,
     ):
         words = [
-            f"drive {k + 1}, {each.bag}: {factor * (each.estimate[at] - whole[at]):+.2f} ± "
-            f"{factor * each.sigma[at]:.2f} {unit}"
+            f"drive {k + 1}, {each.bag}: "
+            + with_sigma(
+                factor * (each.estimate[at] - whole[at]),
+                factor * each.sigma[at],
+                unit,
+                signed=True,
+            )
             for k, each in enumerate(found.drives)
         ]
         axes_strips(axes, np.arange(float(len(found.drives))), words)

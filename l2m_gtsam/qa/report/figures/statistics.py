@@ -23,6 +23,7 @@ from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, PAPER, SMALL, X, Y
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.metrics import Normalised, Row, SensorMetrics
 from l2m_gtsam.solve.chi_square import density
+from l2m_gtsam.text.rounded import with_sigma
 
 CUT = 7.81  # 95 % of chi-square of three
 ALIKE = 3.0  # sigmas: of fifteen parameters one is beyond in 4 % of all drives
@@ -129,10 +130,11 @@ def sigmas_figure(difference: Row, sigma_of: Row, label: str) -> Drawing:
 
 def _difference_words(name: str, difference: float, sigma: float, known: bool) -> str:
     """Return a parameter's difference in its unit with its sigma."""
-    unit = {"t": " m", "C": "", "H": " µT"}[name[0]]
+    unit = {"t": "m", "C": "", "H": "µT"}[name[0]]
     if not known:
         return f"{name}: not determined"
-    return f"{name}: {difference:+.3g} ± {sigma:.2g}{unit}, {difference / sigma:+.1f} sigmas"
+    shown = with_sigma(difference, sigma, unit, signed=True)
+    return f"{name}: {shown}, {difference / sigma:+.1f} sigmas"
 
 
 def correlations(sensor: SensorCalibration) -> FloatArray:

@@ -15,6 +15,7 @@ from l2m_gtsam.qa.fleet import by_sensor
 from l2m_gtsam.qa.report.hover import axes_strips
 from l2m_gtsam.qa.report.svg import AXES, BAD, INK, MUTED, dots, plain_figure
 from l2m_gtsam.records.fleet import DATE, FleetRow
+from l2m_gtsam.text.rounded import with_sigma
 
 SIGMAS = 2  # of the bars
 ROOM = 1.15  # around what is drawn
@@ -104,7 +105,7 @@ def _words(trend: Trend, labels: Sequence[str]) -> list[str]:
     """Return date, values and sigmas of each drive."""
     lines = [
         "; ".join(
-            f"{label} {value:.1f} ± {sigma:.1f}{', outlier' if outlying else ''}"
+            f"{label} {with_sigma(value, sigma)}{', outlier' if outlying else ''}"
             for label, value, sigma, outlying in zip(labels, *each, strict=True)
         )
         for each in zip(trend.values, trend.sigmas, trend.outlying, strict=True)

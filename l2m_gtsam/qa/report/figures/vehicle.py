@@ -24,6 +24,7 @@ from l2m_gtsam.qa.report.svg import (
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import MapPicture
 from l2m_gtsam.records.verdict import Level, Verdict
+from l2m_gtsam.text.rounded import with_sigma
 
 SIGMAS_95 = 5.991**0.5  # half axes that hold 95 %: root of the quantile of chi-square of two
 ESTIMATE, TRUTH = "#d55e00", "black"  # vermilion and black differ for all kinds of colour vision
@@ -71,9 +72,7 @@ def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: Viewpoint)
 def place_words(sensor: SensorCalibration, verdict: Verdict) -> str:
     """Return a sensor's name, verdict and place with standard deviations."""
     parts = [
-        f"{axis} {1e3 * value:.1f} ± {1e3 * sigma:.1f} mm"
-        if np.isfinite(sigma)
-        else f"{axis} not determined"
+        f"{axis} {with_sigma(1e3 * value, 1e3 * sigma, 'mm')}"
         for axis, value, sigma in zip("xyz", sensor.t_lidar_mag, sensor.t_sigma, strict=True)
     ]
     return f"{sensor.sensor}, {verdict[sensor.sensor].level.upper()}: {', '.join(parts)}"

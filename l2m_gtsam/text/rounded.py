@@ -1,0 +1,96 @@
+"""Numbers as a person reads them: as many digits as their standard deviation leaves.
+
+A standard deviation has two significant digits, its value ends at the same decimal, and zeros at
+the end stay. Exponents are for what is below 1e-5 or above 1e7 only.
+"""
+
+from collections.abc import Iterable
+from math import isfinite
+
+OF_SIGMA = 2  # significant digits of a standard deviation
+LEAST, MOST = -5, 7  # decades between which no number has an exponent
+NONE = "–"
+OPEN = "not determined"
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits; a dash where it is none or infinite.
+
+    All digits before the point stay.
+    """
+    if not isfinite(value):
+        return NONE
+    if value == 0:
+        return "0"
+    decade = _decade(value, digits)
+    if not LEAST <= decade < MOST:
+        return f"{value:.{digits - 1}e}"
+    return _ending_at(value, max(digits - 1 - decade, 0))
+
+
+def limit(value: float) -> str:
+    """Return a number that was chosen, of which zeros at the end say nothing."""
+    text = significant(value)
+    return text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
+
+
+def sigma_alone(sigma: float) -> str:
+    """Return a standard deviation; a dash where it is infinite."""
+    places = _places(sigma)
+    return significant(sigma, OF_SIGMA) if places is None else _ending_at(sigma, places)
+
+
+def by_sigma(value: float, sigma: float, unit: str = "", *, signed: bool = False) -> str:
+    """Return a value that ends where its standard deviation does; "not determined" if infinite.
+
+    What is exact, with a standard deviation of zero, has at most six significant digits.
+    """
+    if not isfinite(value) or not isfinite(sigma):
+        return OPEN
+    places = _places(sigma)
+    text = f"{value:g}" if places is None else _ending_at(value, places)
+    return in_unit(f"+{text}" if signed and not text.startswith("-") else text, unit)
+
+
+def with_sigma(value: float, sigma: float, unit: str = "", *, signed: bool = False) -> str:
+    """Return a value with its standard deviation and unit; "not determined" if that is infinite."""
+    text = by_sigma(value, sigma, signed=signed)
+    if text == OPEN:
+        return text
+    return in_unit(f"{text} ± {sigma_alone(sigma)}", unit)
+
+
+def in_unit(number: str, unit: str) -> str:
+    """Return a number with its unit, with a space between unless the unit is that of an angle."""
+    return f"{number}{'' if unit in ('', '°', '%') else ' '}{unit}"
+
+
+def vector_by_sigma(values: Iterable[float], sigmas: Iterable[float]) -> str:
+    """Return a vector in brackets, each entry by its standard deviation."""
+    return f"({', '.join(map(by_sigma, values, sigmas))})"
+
+
+def vector_of_sigmas(sigmas: Iterable[float]) -> str:
+    """Return standard deviations in brackets; a dash for each that is infinite."""
+    return f"({', '.join(map(sigma_alone, sigmas))})"
+
+
+def _decade(value: float, digits: int) -> int:
+    """Return the power of ten of the first digit, once it is rounded to so many."""
+    return int(f"{value:.{digits - 1}e}".partition("e")[2])
+
+
+def _places(sigma: float) -> int | None:
+    """Return the decimal at which a standard deviation ends, below zero before the point."""
+    if not isfinite(sigma) or sigma <= 0:
+        return None
+    return OF_SIGMA - 1 - _decade(sigma, OF_SIGMA)
+
+
+def _ending_at(value: float, places: int) -> str:
+    # adding zero takes the sign from a zero
+    rounded = round(float(value), places) + 0.0
+    decade = _decade(rounded, 1) if rounded else 0
+    if not LEAST <= decade < MOST:
+        return f"{rounded:.{max(decade + places, 0)}e}"
+    return f"{rounded:.{max(places, 0)}f}"
