@@ -301,6 +301,7 @@ def robust_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
         s = found.sensor
         rows = problem.batch.rows_of(s)
         residual = problem.batch.residuals(values, s).residual[rows]
+        white = np.einsum("nij,nj->ni", optimum.whitenings[rows], residual)
         white = (W[rows] @ residual[:, :, None]).ravel()
         own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
         covariance, together = HalfCovariance.of(optimum.among((s,))), len(problem.view.sensors)
@@ -320,13 +321,14 @@ def _solutions(
     for s in problem.view.sensors:
         rows, test = problem.batch.rows_of(s), problem.determinacies[s]
         residual = problem.batch.residuals(values, s).residual[rows]
+        white = np.einsum("nij,nj->ni", optimum.whitenings[rows], residual)
         covariance = among((s,))
         gradient = np.concatenate([gradients.at(key) for key in keys_of(s)])
         solutions.append(
             SensorSolution(
                 sensor=s,
                 joint_covariance=with_infinities(covariance, test),
-                figures=residual_figures(residual, optimum.whitenings[rows], test.free),
+                figures=residual_figures(residual, white, test.free),
                 determinacy=test,
                 remaining_sigmas=float(np.sqrt(gradient @ covariance @ gradient)),
                 contradictions=tuple(each for each in missed if s in each.sensors),

@@ -98,12 +98,13 @@ class UncertainOptimum:
         solutions = []
         for row, s in enumerate(sensors):
             rows, own = problem.batch.rows_of(s), slice(SENSOR * row, SENSOR * (row + 1))
-            left, sigma = self._residual[rows], problem.noise.alone[rows]
+            white = np.einsum("nij,nj->ni", problem.noise.alone[rows], self._residual[rows])
+            residual = problem.batch.residuals(self.values, s).residual[rows]
             solutions.append(
                 SensorSolution(
                     sensor=s,
                     joint_covariance=with_infinities(every[own, own], tests[s]),
-                    figures=residual_figures(left, sigma, self._taken(s)),
+                    figures=residual_figures(residual, white, self._taken(s)),
                     determinacy=tests[s],
                     remaining_sigmas=joint.sigmas(s),
                     contradictions=tuple(each for each in missed if s in each.sensors),

@@ -324,7 +324,6 @@ def _sensor(drive: SuiteDrive, solution: SuiteSolution, i: int) -> SensorCalibra
     status, message = _ending(solution)
     noise = float(solution.last.windows.prior.noise * np.cbrt(np.linalg.det(distortion.C)))
     residual = solution.residuals[i]
-    white = np.tile(np.eye(3) / noise, (len(residual), 1, 1))
     return SensorCalibration(
         sensor=drive.readings.sensors[i],
         status=status,
@@ -335,7 +334,9 @@ def _sensor(drive: SuiteDrive, solution: SuiteSolution, i: int) -> SensorCalibra
         covariance=covariance[:TAU, :TAU],
         rotation_covariance=rotation.covariance,
         noise=noise,
-        residuals=residual_figures(residual, white, taken=0.0) if len(residual) else None,
+        residuals=residual_figures(residual, residual / noise, taken=0.0)
+        if len(residual)
+        else None,
         undetermined=(),
         sync=drive.counts[i],
         outside_map=0,

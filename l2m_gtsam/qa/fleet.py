@@ -46,6 +46,7 @@ def _row(sensor: SensorCalibration, own: SensorVerdict, shared: tuple[Reason, ..
         residual_rms=NAN if figures is None else figures.rms,
         chi2=NAN if figures is None else figures.chi2_per_dof,
         rejected=_rejected(sensor),
+        own_verdict=own.level.value,
     )
 
 

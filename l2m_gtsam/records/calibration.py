@@ -105,9 +105,18 @@ class Uncertainty(StrEnum):
 
 @dataclass(frozen=True)
 class ResidualFigures:
-    """Residuals ``C b + H - z`` of one sensor over the readings used, in microtesla.
+    """Residuals of one sensor over the readings used, in microtesla.
 
-    ``chi2_per_dof`` compares them with the noise that the solve assumed: 1 is consistent.
+    Attributes
+    ----------
+    readings
+        How many.
+    rms_axes, rms, median_norm, p95_norm, max_norm
+        Of ``C b + H - z``, with the field that the map has at the poses as they were given: root
+        mean square along the sensor's axes and of the length, and more of the length.
+    chi2_per_dof
+        Compares what is left of them, once the errors of map and poses that the solve found are
+        taken out, with the noise that it assumed: 1 is consistent.
     """
 
     readings: int

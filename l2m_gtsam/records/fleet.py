@@ -70,6 +70,8 @@ class SensorRow(Record):
         Of the residuals per degree of freedom: 1 is consistent.
     rejected
         Share of the readings inside the map that were rejected.
+    own_verdict
+        That of the sensor alone; empty in files of before.
     """
 
     sensor: str
@@ -87,6 +89,7 @@ class SensorRow(Record):
     residual_rms: float
     chi2: float
     rejected: float
+    own_verdict: str = ""
 
 
 @dataclass(frozen=True)

@@ -143,20 +143,20 @@ def estimate_noise(residual: FloatArray, map_variance: FloatArray, taken: float)
     return float(np.exp(brentq(score, low, high, xtol=1e-6)))
 
 
-def residual_figures(residual: FloatArray, whitening: FloatArray, taken: float) -> ResidualFigures:
+def residual_figures(residual: FloatArray, white: FloatArray, taken: float) -> ResidualFigures:
     """Summarise the residuals of one sensor.
 
     Parameters
     ----------
     residual
         ``C b + H - z`` in uT, shape (N, 3).
-    whitening
-        Matrices that make them white, shape (N, 3, 3).
+    white
+        What is left of them once errors that readings share are taken out, in units of its standard
+        deviation, shape (N, 3): of these is the chi-square.
     taken
         Degrees of freedom that the fit took; see ``estimate_noise``.
     """
     norm = np.linalg.norm(residual, axis=1)
-    white = np.einsum("nij,nj->ni", whitening, residual)
     freedom = max(residual.size - taken, 1)
     return ResidualFigures(
         readings=len(residual),

@@ -12,7 +12,7 @@ from l2m_gtsam.records.metrics import Row
 from l2m_gtsam.storage.files import atomic_path
 
 MISSING = "fleet.parquet needs pyarrow, fleet.csv has the same: pip install 'l2m-gtsam[fleet]'"
-TEXTS = ("vehicle", "bag", "sensor", "verdict", "reason", "outliers", "folder")
+TEXTS = ("vehicle", "bag", "sensor", "verdict", "sensor_verdict", "reason", "outliers", "folder")
 # What spreadsheets take for a formula at the beginning of a cell.
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
@@ -28,6 +28,7 @@ def flat(row: FleetRow) -> dict[str, Cell]:
         "date": row.date,
         "sensor": "" if sensor is None else sensor.sensor,
         "verdict": row.verdict,
+        "sensor_verdict": "" if sensor is None else sensor.own_verdict,
         "reason": row.reason,
         "outliers": "; ".join(map(str, row.outliers)),
         **_numbers(sensor),

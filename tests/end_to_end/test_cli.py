@@ -9,9 +9,10 @@ import pytest
 from PIL import Image
 
 from l2m_gtsam.errors import BagError
-from l2m_gtsam.records.calibration import SensorStatus
+from l2m_gtsam.records.calibration import SensorStatus, Uncertainty
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
+from l2m_gtsam.storage.record_files import read_metrics
 from tests.drives.bags import Entry, ros, write
 from tests.support.browsing import drawn_figures
 from tests.support.command_line import Demo, complaint_here, ended, l2m, l2m_process, one_line
@@ -68,6 +69,24 @@ def test_the_report_of_a_hall_has_its_figures(demo: Demo) -> None:
     drawn = drawn_figures(demo.folder / "report.html")
     assert len(drawn) == 4 + 8 * 2  # of vehicle and map, and of each sensor
     assert min(drawn) > 5
+
+
+def test_residuals_and_readings_are_the_same_everywhere(demo: Demo) -> None:
+    """In terminal, file, metrics and page, although the solve counts errors of map and poses."""
+    result = read_calibration(demo.folder / "calibration.yaml")
+    metrics = read_metrics(demo.folder / "metrics.json")
+    page = (demo.folder / "report.html").read_text()
+    assert result.uncertainty is Uncertainty.FULL
+    for sensor in result.sensors:
+        left, found = sensor.residuals, metrics.get(sensor.sensor)
+        assert left is not None
+        assert found is not None
+        # the last step moves clocks by up to 0.1 ms after the poses were taken
+        np.testing.assert_allclose(found.fit.rms, left.rms_axes, rtol=5e-3)
+        assert left.rms == pytest.approx(np.linalg.norm(left.rms_axes))
+        axes = ", ".join(f"{each:.3f}" for each in left.rms_axes)
+        assert f"rms {axes} µT along x, y, z, {left.rms:.3f} µT of the length" in page
+        assert f"{left.readings:,} readings (effective" in page
 
 
 def test_inspect_shows_every_topic(demo: Demo) -> None:

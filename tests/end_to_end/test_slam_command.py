@@ -12,11 +12,14 @@ from evo.tools import file_interface
 
 from l2m_gtsam.batch.reports import report_folder
 from l2m_gtsam.data import Distortion
+from l2m_gtsam.qa.metrics.trajectory import localised_trajectory
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
+from l2m_gtsam.storage.record_files import read_slam
 from l2m_gtsam.storage.trajectory_files import write_tum
+from l2m_gtsam.text.rounded import significant
 from tests.drives.calibrations import calibration, sensor
 from tests.drives.yard import calibrated_yard
 from tests.support.command_line import complaint_here, l2m
@@ -114,7 +117,14 @@ def test_a_drive_is_localised(yard: Yard, field_map: Path, known: Path, tmp_path
         *("--out", out),
     )
     fixed = configured(yard, tmp_path, calibration="fixed", start={"position_m": 0.02})
-    l2m("slam", yard.west, *files[:-4], "--config", fixed, "--out", out)
+    again = l2m("slam", yard.west, *files[:-4], "--config", fixed, "--out", out).out
+    # the terminal has the sigma that the page shows and the verdict judges
+    sigma = 1e3 * localised_trajectory(read_slam(out / "slam.json")).position_sigma
+    known_to = [significant(each, 2) for each in (np.median(sigma), sigma.max())]
+    assert f"{known_to[0]} mm in the median, {known_to[1]} mm at worst" in again
+    assert (
+        f"{known_to[0]} in the median, {known_to[1]} at worst" in (out / "report.html").read_text()
+    )
     assert not (out / "refined.yaml").exists()
     check_report(out, tmp_path)
 

@@ -44,7 +44,7 @@ MODEL_HEADINGS = (
 
 def calibration_table(result: CalibrationResult) -> Table:
     """Return one row per sensor: position, H and rotation with their sigmas, clock, readings."""
-    title = "Calibration: B_meas = C @ B_lidar + H; rms: of the residuals; ±: one sigma"
+    title = "Calibration: B_meas = C @ B_lidar + H; rms: length of residuals; ±: one sigma"
     table = plain_table(title)
     table.add_column("sensor", no_wrap=True)
     table.add_column("status", no_wrap=True)

@@ -6,6 +6,7 @@ from rich.table import Table
 
 from l2m_gtsam.batch.online_slam import OnlineOutcome
 from l2m_gtsam.cli.tables import new_table
+from l2m_gtsam.geometry import to_ros
 from l2m_gtsam.records.localisation import Gain, LocalisationResult, ScanUse, StartSearch
 from l2m_gtsam.records.localisation_file import TruthRecord
 from l2m_gtsam.text.rounded import significant
@@ -16,7 +17,7 @@ MOST_EVENTS = 20  # that are printed
 def slam_table(result: LocalisationResult) -> Table:
     """Return one row per sensor: what its readings were worth."""
     counts = ("on key poses", "rejected", "outside map")
-    table = new_table("Readings", "sensor", ["rms (uT)", "chi2 per dof", *counts])
+    table = new_table("Readings", "sensor", ["rms per axis (uT)", "chi2 per dof", *counts])
     for each in result.sensors:
         table.add_row(
             escape(each.sensor),
@@ -53,10 +54,11 @@ def drift_lines(result: LocalisationResult) -> tuple[str, ...]:
     )
     lines = [f"{result.status.value}: {result.message}", drifted]
     if covariance is not None:
-        sigma = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
+        in_map = to_ros(covariance, result.trajectory.R)[:, :3, :3]
+        sigma = 1e3 * np.sqrt(np.diagonal(in_map, axis1=1, axis2=2).max(axis=1))
         known = (
-            f"stated error of the positions, all three axes together: {1e3 * np.median(sigma):.0f} "
-            f"mm in the median, {1e3 * sigma.max():.0f} mm at most (1 sigma)"
+            f"positions are known to {significant(np.median(sigma), 2)} mm in the median, "
+            f"{significant(sigma.max(), 2)} mm at worst (1 sigma along the worst axis)"
         )
         lines.append(known)
     return tuple(lines)

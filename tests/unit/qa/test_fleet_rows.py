@@ -1,5 +1,7 @@
 """Rows of a fleet from calibrations: their numbers, and the gravest reason."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,8 +9,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.qa.fleet import sensor_rows
+from l2m_gtsam.qa.options import FleetOptions
+from l2m_gtsam.qa.report.fleet_page import fleet_page
 from l2m_gtsam.records.calibration import ResidualFigures, SensorStatus
+from l2m_gtsam.records.fleet import FleetRow
 from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Verdict
+from l2m_gtsam.storage.fleet_table import flat
 from tests.drives.calibrations import calibration, open_in, sensor, unsolved
 
 NOTE, DOUBT, GRAVE = (Reason(level, level.upper()) for level in Level)
@@ -33,6 +39,17 @@ def test_the_gravest_reason_counts(
 ) -> None:
     (row,) = sensor_rows(calibration(sensor()), verdict("mag", own, shared))
     assert (row.verdict, row.reason) == (level, reason)
+
+
+def test_the_sensors_own_verdict_is_kept_beside_that_of_the_drive() -> None:
+    """In the table and on the page, where it is better."""
+    judged = Verdict.of([DOUBT], [SensorVerdict.of("mag", [NOTE])])
+    (found,) = sensor_rows(calibration(sensor()), judged)
+    row = FleetRow("truck", "a.bag", "truck/a", "2026-05-01T10:00:00Z", 60.0, found, "")
+    assert (flat(row)["verdict"], flat(row)["sensor_verdict"]) == ("warn", "pass")
+    assert "sensor: PASS" in fleet_page([row], FleetOptions())
+    same = replace(row, sensor=replace(found, own_verdict="warn"))
+    assert "sensor: WARN" not in fleet_page([same], FleetOptions())
 
 
 @given(st.integers(0, 1000))

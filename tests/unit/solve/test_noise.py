@@ -81,9 +81,9 @@ def test_noise_of_residuals_below_the_maps_own_is_the_floor() -> None:
 
 def test_figures_of_known_residuals() -> None:
     residual = np.array([[3.0, 0, 0], [0, 4.0, 0], [0, 0, 12.0]])
-    figures = residual_figures(residual, np.broadcast_to(np.eye(3), (3, 3, 3)), taken=5)
+    figures = residual_figures(residual, residual / 2, taken=5)
     assert figures.rms == pytest.approx(np.sqrt(169 / 3))
     assert figures.median_norm == 4.0
     assert figures.max_norm == 12.0
-    assert figures.chi2_per_dof == pytest.approx(169 / 4)
+    assert figures.chi2_per_dof == pytest.approx(169 / 4 / 4)
     np.testing.assert_allclose(figures.rms_axes, np.array([3, 4, 12]) / np.sqrt(3))
