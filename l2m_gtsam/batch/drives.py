@@ -125,8 +125,9 @@ def calibrate_drive(
     drives = [each.trajectory for each in recording.parts]
     figure = calibration_figure(metrics.map, drives, result, truth)
     with published(out, CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE) as stage:
-        write_calibration(stage / CALIBRATION_FILE, result)
         write_metrics(stage / METRICS_FILE, metrics)
+        result = replace(result, metrics_sha256=source_file(stage / METRICS_FILE).sha256)
+        result = write_calibration(stage / CALIBRATION_FILE, result)
         save_figure(figure, stage / OVERVIEW_FILE)
     progress(FIGURES, 1.0)
     if view is not None:

@@ -6,7 +6,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -19,26 +19,41 @@ from l2m_gtsam.batch.drives import (
 )
 from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.config import load_config
-from l2m_gtsam.errors import ConfigError, OutputError
+from l2m_gtsam.errors import CalibrationError, ConfigError, OutputError
 from l2m_gtsam.options import first_fault
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.calibration_page import STAGE, calibration_page
+from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.qa.verdict.calibration import judge, judgement_of
 from l2m_gtsam.qa.verdict.mounting import check_names
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics
-from l2m_gtsam.records.verdict import Judgement, Verdict
+from l2m_gtsam.records.verdict import Judgement, Level, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
-from l2m_gtsam.storage.files import atomic_path
-from l2m_gtsam.storage.record_files import read_metrics, read_slam, write_slam
+from l2m_gtsam.storage.files import atomic_path, source_file
+from l2m_gtsam.storage.record_files import read_metrics, read_slam, record_id, write_slam
+from l2m_gtsam.storage.report_id import SHOWN
 from l2m_gtsam.storage.result_set import published
 
 SLAM_FILE = "slam.json"
 
 
-def report_localisation(folder: Path, config: Path | None, page: Path) -> Judgement:
+@dataclass(frozen=True)
+class Reported:
+    """What a report says: its judgement, and its id."""
+
+    judgement: Judgement
+    report_id: str
+
+    @property
+    def level(self) -> Level:
+        """The verdict of the whole."""
+        return self.judgement.level
+
+
+def report_localisation(folder: Path, config: Path | None, page: Path) -> Reported:
     """Write the report on the localisation in a folder, and its verdict if that is another.
 
     Parameters
@@ -69,17 +84,21 @@ def report_localisation(folder: Path, config: Path | None, page: Path) -> Judgem
     judgement = judgement_of_localisation(found, options)
     record = replace(found, judgement=judgement)
     with published(folder, adds=True) as stage:
-        write_slam_report(stage / page.name, record, options)
         if judgement != found.judgement:
-            write_slam(stage / SLAM_FILE, record)
-    return judgement
+            source = stage / SLAM_FILE
+            write_slam(source, record)
+        identity = Identity(record_id(source), source_file(source))
+        write_slam_report(stage / page.name, record, options, identity)
+    return Reported(judgement, identity.id)
 
 
-def write_slam_report(page: Path, record: LocalisationRecord, options: QaOptions) -> None:
-    """Write the report on a localisation."""
+def write_slam_report(
+    page: Path, record: LocalisationRecord, options: QaOptions, identity: Identity
+) -> None:
+    """Write the report on a localisation, which has an identity."""
     from l2m_gtsam.qa.report.localisation_page import localisation_page
 
-    text = localisation_page(record, options)
+    text = localisation_page(record, options, identity)
     with published(page.parent, page.name, adds=True) as stage:
         _write_page(stage / page.name, text)
 
@@ -151,7 +170,7 @@ OUTCOME_FILE = "outcome.json"
 
 def report_folder(
     folder: Path, config: Path | None, progress: Progress = silent, *, pdf: bool = False
-) -> Judgement:
+) -> Reported:
     """Write `report.html` from what is in a folder, and into the result what it was judged.
 
     Parameters
@@ -174,13 +193,13 @@ def report_folder(
     progress(STAGE, 0.0)
     check_outputs(folder / REPORT_FILE, folder / PDF_FILE)
     if holds_localisation(folder):
-        judgement = report_localisation(folder, config, folder / REPORT_FILE)
+        reported = report_localisation(folder, config, folder / REPORT_FILE)
     else:
-        judgement = _report_calibration(folder, config, progress)
+        reported = _report_calibration(folder, config, progress)
     if pdf:
         print_page(folder / REPORT_FILE, folder / PDF_FILE)
     progress(STAGE, 1.0)
-    return judgement
+    return reported
 
 
 @contextmanager
@@ -230,7 +249,10 @@ def report_calibration(
     progress(STAGE, 0.0)
     check_outputs(folder / REPORT_FILE)
     holds_localisation(folder)
-    verdict = write_report(folder, found.result, found.metrics, options, progress)
+    written = folder / CALIBRATION_FILE
+    source = source_file(written) if written.exists() else None
+    identity = Identity(found.result.report_id, source) if source else None
+    verdict = write_report(folder, found.result, found.metrics, options, progress, identity)
     progress(STAGE, 1.0)
     return verdict
 
@@ -253,19 +275,27 @@ def holds_localisation(folder: Path) -> bool:
     return True
 
 
-def _report_calibration(folder: Path, config: Path | None, progress: Progress) -> Judgement:
+def _report_calibration(folder: Path, config: Path | None, progress: Progress) -> Reported:
     source = folder / CALIBRATION_FILE
     found = read_calibration(source)
     metrics = read_metrics(folder / METRICS_FILE)
+    digest = source_file(folder / METRICS_FILE).sha256
+    if found.metrics_sha256 not in ("", digest):
+        raise CalibrationError(
+            f"{folder / METRICS_FILE}: is not the file that {CALIBRATION_FILE} was written with "
+            f"(report {found.report_id[:SHOWN]}), or was changed; restore it, or calibrate again"
+        )
     options = _saved(found) if config is None else load_config(config).qa
     check_names([each.sensor for each in found.sensors], options)
     judgement = judgement_of(found, metrics, options)
-    result = replace(found, judgement=judgement)
+    result = replace(found, judgement=judgement, metrics_sha256=digest)
     with published(folder, adds=True) as stage:
-        write_report(stage, result, metrics, options, progress)
         if judgement != found.judgement:
-            write_calibration(stage / CALIBRATION_FILE, result)
-    return judgement
+            source = stage / CALIBRATION_FILE
+            result = write_calibration(source, result)
+        identity = Identity(result.report_id, source_file(source))
+        write_report(stage, result, metrics, options, progress, identity)
+    return Reported(judgement, identity.id)
 
 
 def write_report(
@@ -274,8 +304,9 @@ def write_report(
     metrics: Metrics,
     options: QaOptions,
     progress: Progress = silent,
+    identity: Identity | None = None,
 ) -> Verdict:
-    """Write the report on a calibration and return its verdict.
+    """Write the report on a calibration and return its verdict; parameters as of the page.
 
     Raises
     ------
@@ -285,7 +316,7 @@ def write_report(
         It cannot be written.
     """
     check_names([each.sensor for each in result.sensors], options)
-    page = calibration_page(result, metrics, options, progress)
+    page = calibration_page(result, metrics, options, progress, identity)
     with published(folder, REPORT_FILE, adds=True) as stage:
         _write_page(stage / REPORT_FILE, page)
     return judge(result, metrics, options)

@@ -22,6 +22,7 @@ from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.metrics.pose_errors import check_truth
+from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.qa.verdict.localisation import judgement_of_localisation
 from l2m_gtsam.recording.odometry_jumps import without_jumps
 from l2m_gtsam.recording.sync import twists
@@ -42,7 +43,7 @@ from l2m_gtsam.storage.files import atomic_path, source_file
 from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.point_cloud2 import has_clouds
 from l2m_gtsam.storage.pose_files import read_tum
-from l2m_gtsam.storage.record_files import write_slam
+from l2m_gtsam.storage.record_files import record_id, write_slam
 from l2m_gtsam.storage.result_set import published
 from l2m_gtsam.storage.trajectory_files import LocalisedMotion, write_trajectory_bag, write_tum
 
@@ -252,7 +253,8 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
         _write(found, record, config, stage)
         if saved is None:
             _write_map(found, config, stage, failed=bool(judged))
-        write_slam_report(stage / REPORT_FILE, record, config.qa)
+        identity = Identity(record_id(stage / SLAM_FILE), source_file(stage / SLAM_FILE))
+        write_slam_report(stage / REPORT_FILE, record, config.qa, identity)
     return SlamOutcome(found.result, record, judgement.verdict)
 
 
@@ -315,7 +317,8 @@ def check_not_replaced(calibration: Path, out: Path) -> None:
 def write_refined(out: Path, calibration: CalibrationResult) -> None:
     """Write a calibration as a drive refined it, with a note on its verdict."""
     notes = (*calibration.notes, REFINED)
-    write_calibration(out / REFINED_FILE, replace(calibration, bags=(), notes=notes))
+    made = replace(calibration, bags=(), notes=notes, metrics_sha256="")
+    write_calibration(out / REFINED_FILE, made)
 
 
 def _write(found: _Found, record: LocalisationRecord, config: Config, out: Path) -> None:

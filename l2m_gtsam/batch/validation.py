@@ -16,6 +16,7 @@ from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.metrics.changes import compare_calibrations, is_calibrated
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.qa.report.validation_page import validation_page
 from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
@@ -209,8 +210,8 @@ def _source(role: str, path: Path) -> NamedSource:
 
 
 def _write(folder: Path, found: Validation) -> None:
-    page = validation_page(found)
     with published(folder, VALIDATION_FILE, PAGE_FILE) as stage:
-        write_validation(stage / VALIDATION_FILE, found)
+        written = write_validation(stage / VALIDATION_FILE, found)
+        page = validation_page(found, Identity(written, source_file(stage / VALIDATION_FILE)))
         with atomic_path(stage / PAGE_FILE) as temporary:
             temporary.write_text(page, encoding="utf-8", errors="replace")

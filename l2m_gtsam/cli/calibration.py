@@ -20,6 +20,7 @@ from l2m_gtsam.cli.terminal import (
     print_table,
     print_verdict,
     say,
+    say_written,
     shown_progress,
     warn,
 )
@@ -196,7 +197,7 @@ def calibrate(
     _print_calibration(found.result, models, wide)
     print_verdict(verdict)
     written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
-    say(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
+    say_written([*written, *([view] if view else [])], found.result.report_id)
     end_with(verdict.level, strict)
 
 

@@ -15,6 +15,7 @@ from l2m_gtsam.cli.terminal import (
     print_table,
     print_verdict,
     say,
+    say_written,
     shown_progress,
     warn,
 )
@@ -52,11 +53,11 @@ def report(
     with shown_progress() as progress:
         from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
 
-        judged = report_folder(folder, config, progress, pdf=pdf)
-    print_verdict(judged.verdict)
-    warn([f"the verdict was {each}" for each in judged.disagreeing])
+        reported = report_folder(folder, config, progress, pdf=pdf)
+    print_verdict(reported.judgement.verdict)
+    warn([f"the verdict was {each}" for each in reported.judgement.disagreeing])
     written = [folder / REPORT_FILE, *([folder / PDF_FILE] if pdf else [])]
-    say(f"written: {', '.join(map(str, written))}")
+    say_written(written, reported.report_id)
 
 
 def validate(
@@ -97,6 +98,7 @@ def validate(
         )
         from l2m_gtsam.cli.tables.validation import change_table, validation_table
         from l2m_gtsam.records.verdict import Level
+        from l2m_gtsam.storage.record_files import record_id
 
         asked = ValidationRequest(
             calibration, bag, map_path, compare, config, out, tuple(poses or ()), times
@@ -108,7 +110,8 @@ def validate(
         print_table(change_table(found.comparison), wide)
     print_verdict(found.verdict, Level.PASS)
     if out is not None:
-        say(f"written: {out / VALIDATION_FILE}, {out / PAGE_FILE}")
+        written = [out / VALIDATION_FILE, out / PAGE_FILE]
+        say_written(written, record_id(out / VALIDATION_FILE))
     end_with(found.verdict.level, strict)
 
 

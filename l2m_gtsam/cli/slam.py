@@ -16,6 +16,7 @@ from l2m_gtsam.cli.terminal import (
     print_table,
     print_verdict,
     say,
+    say_written,
     shown_progress,
 )
 from l2m_gtsam.errors import ConfigError
@@ -83,6 +84,7 @@ def _print_online(done: "OnlineOutcome", out: Path) -> None:
 
 
 def _print_off_line(done: "SlamOutcome", out: Path, wide: bool) -> None:
+    from l2m_gtsam.batch.reports import SLAM_FILE
     from l2m_gtsam.cli.tables.slam import (
         drift_lines,
         gain_lines,
@@ -91,6 +93,7 @@ def _print_off_line(done: "SlamOutcome", out: Path, wide: bool) -> None:
         start_lines,
         truth_lines,
     )
+    from l2m_gtsam.storage.record_files import record_id
 
     print_table(slam_table(done.result), wide)
     lines = (
@@ -102,4 +105,4 @@ def _print_off_line(done: "SlamOutcome", out: Path, wide: bool) -> None:
     )
     say(*lines)
     print_verdict(done.verdict)
-    say(f"written: {out}")
+    say_written([out], record_id(out / SLAM_FILE))

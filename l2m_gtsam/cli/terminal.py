@@ -108,6 +108,13 @@ def say(*lines: str) -> None:
         typer.echo(shown(line))
 
 
+def say_written(files: Sequence[Path], report_id: str) -> None:
+    """Print which files were written, and in the last line the id of the report on them."""
+    from l2m_gtsam.storage.report_id import SHOWN
+
+    say(f"written: {', '.join(map(str, files))}", f"report id: {report_id[:SHOWN]}")
+
+
 @contextmanager
 def shown_notices() -> Iterator[None]:
     """Show notices of this program as its warnings; others appear as Python has them."""

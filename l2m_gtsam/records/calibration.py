@@ -4,7 +4,7 @@ Frames and units are those of ``data``.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from types import GenericAlias
 from typing import Annotated, Any, get_args
@@ -391,6 +391,11 @@ class CalibrationResult:
     unseen_warp_m
         Shifts of the drive's frame against the map's that readings leave possible, root mean square
         along each axis of the floor in metres; sigmas hold them. Absent where a bend was found.
+    metrics_sha256
+        Of the file with the figures that it was judged by; empty where there is none.
+    report_id
+        Of the file that it was written to or read from; empty where there is none, and no part of
+        what is compared.
     """
 
     sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]
@@ -412,6 +417,8 @@ class CalibrationResult:
     stated: tuple[StatedSize, ...] = ()
     pose_duration: PoseDuration | None = None
     unseen_warp_m: float | None = None
+    metrics_sha256: str = ""
+    report_id: str = field(default="", compare=False)
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

@@ -1,7 +1,7 @@
 """``calibration.yaml``: everything about each sensor, with formulas and units inside."""
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from l2m_gtsam.records.calibration import (
 )
 from l2m_gtsam.records.error_budget import EXPLAINED
 from l2m_gtsam.records.verdict import NOT_JUDGED, Judgement
+from l2m_gtsam.storage.report_id import checked_id, with_id
 from l2m_gtsam.storage.result_set import check_set
 from l2m_gtsam.storage.yaml_file import checked, read_yaml, write_yaml
 
@@ -39,6 +40,10 @@ UNCERTAINTY = {
 }
 
 MODEL = {
+    "id": (
+        "the report id: SHA-256 of all that this file says but for the id itself, as JSON with "
+        "sorted keys and no spaces; metrics_sha256: of metrics.json, which the report is drawn from"
+    ),
     "measurement": "B_meas = C @ B_lidar + H",
     "correction": "B_lidar = inv(C) @ (B_meas - H)",
     "units": {"B": "uT", "H": "uT", "C": "1", "t": "m", "rotation": "rad", "noise": "uT"},
@@ -117,7 +122,7 @@ MODEL = {
 }
 OPTIONAL = (
     *("notes", "exact", "disturbances", "stated", "pose_duration", "unseen_warp_m"),
-    *("traces", "sources"),
+    *("traces", "sources", "metrics_sha256"),
 )
 SENSOR_KEYS = (
     *("status", "message", "t_lidar_mag", "t_sigma", "C", "C_sigma", "H", "H_sigma"),
@@ -146,8 +151,15 @@ _SENSOR = TypeAdapter(SensorCalibration)
 _JUDGEMENT = TypeAdapter(Judgement)
 
 
-def write_calibration(path: Path, result: CalibrationResult) -> None:
-    """Write a calibration; `read_calibration` gives it back equal."""
+def write_calibration(path: Path, result: CalibrationResult) -> CalibrationResult:
+    """Write a calibration, and return it with its id; `read_calibration` gives it back equal."""
+    content = calibration_content(result)
+    write_yaml(path, content, HEADER)
+    return replace(result, report_id=content["id"])
+
+
+def calibration_content(result: CalibrationResult) -> dict[str, Any]:
+    """Return all that the file of a calibration says, plain values with the id of them."""
     plain = _RESULT.dump_python(result, exclude={"sensors"})
     judged = {} if result.judgement is None else {"verdict": verdict_entry(result.judgement)}
     disagreements = [
@@ -157,6 +169,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
     content = {
         "format": FORMAT,
         "version": VERSION,
+        "metrics_sha256": plain["metrics_sha256"],
         **judged,
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
         "uncertainty": plain["uncertainty"],
@@ -178,7 +191,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
     }
     for name in OPTIONAL:
         content = _without_empty(content, name)
-    write_yaml(path, content, HEADER)
+    return with_id(content, "version")
 
 
 def read_calibration(path: Path) -> CalibrationResult:
@@ -187,7 +200,7 @@ def read_calibration(path: Path) -> CalibrationResult:
     Raises
     ------
     CalibrationError
-        The file is missing, damaged or something else.
+        The file is missing, damaged, something else, or was changed after it was written.
     """
     return calibration_in(path, read_yaml(path, CalibrationError))
 
@@ -201,9 +214,9 @@ def calibration_in(path: Path, content: Any) -> CalibrationResult:
             f"{path}: verdict.level: {found.judgement.verdict.level.upper()} does not follow from "
             "its reasons; it was edited: calibrate again"
         )
-    return CalibrationResult(
-        **{each.name: getattr(found, each.name) for each in fields(CalibrationResult)}
-    )
+    names = [each.name for each in fields(CalibrationResult)]
+    result = CalibrationResult(**{name: getattr(found, name) for name in names})
+    return replace(result, report_id=checked_id(path, content, CalibrationError))
 
 
 def _as_record(content: dict[str, Any]) -> dict[str, Any]:

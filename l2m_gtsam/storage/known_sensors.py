@@ -13,6 +13,7 @@ from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Matrix, Vector
 from l2m_gtsam.errors import CalibrationError, Notice
 from l2m_gtsam.records.calibration import SensorStatus, TimeOffset
 from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.storage.report_id import checked_id
 from l2m_gtsam.storage.yaml_file import checked, read_yaml, write_yaml
 
 SIZE, TAU = 16, 15  # (t, C row by row, H, time offset); the last is the offset
@@ -310,9 +311,11 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     Raises
     ------
     CalibrationError
-        The file is missing or is not of this form.
+        The file is missing, is not of this form, or was changed after it was written.
     """
-    found = checked(path, read_yaml(path, CalibrationError), _FILE)
+    content = read_yaml(path, CalibrationError)
+    found = checked(path, content, _FILE)
+    checked_id(path, content, CalibrationError)
     if found.verdict is not None and found.verdict.level is Level.FAIL:
         warnings.warn(f"{path}: its verdict is FAIL; its sensors are used", Notice, stacklevel=2)
     return {

@@ -3,11 +3,12 @@
 Each file is a head with format and version, then the record. Files are read without trust.
 """
 
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -22,6 +23,7 @@ from l2m_gtsam.records.validation import Validation
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.number_ranges import odd_poses
+from l2m_gtsam.storage.report_id import checked_id, report_id
 from l2m_gtsam.storage.result_set import check_set
 
 MAX_BYTES = 100_000_000  # figures of a hundred sensors are some megabytes
@@ -61,6 +63,7 @@ class _MetricsFile(Record):
 class _ValidationFile(Record):
     format: Literal["l2m-validation"]
     version: Literal[1]
+    id: str = field(default="", kw_only=True)
     validation: Validation
 
 
@@ -68,6 +71,7 @@ class _ValidationFile(Record):
 class _SlamHead(Record):
     format: Literal["l2m-slam"]
     version: Literal[4]
+    id: str = field(default="", kw_only=True)
     legend: dict[str, str]
 
 
@@ -107,11 +111,12 @@ def read_metrics(path: Path) -> Metrics:
     return _read(path, _METRICS, "metrics", writer).metrics
 
 
-def write_validation(path: Path, validation: Validation) -> None:
-    """Write ``validation.json``; `read_validation` gives it back equal."""
-    _write(
-        path, _VALIDATION.dump_json(_ValidationFile("l2m-validation", 1, validation), by_alias=True)
-    )
+def write_validation(path: Path, validation: Validation) -> str:
+    """Write ``validation.json`` and return its id; `read_validation` gives it back equal."""
+    file = _ValidationFile("l2m-validation", 1, validation)
+    found = report_id(json.loads(_VALIDATION.dump_json(file, by_alias=True)))
+    _write(path, _VALIDATION.dump_json(replace(file, id=found), by_alias=True))
+    return found
 
 
 def read_validation(path: Path) -> Validation:
@@ -126,8 +131,8 @@ def read_validation(path: Path) -> Validation:
     return _read(path, _VALIDATION, "validation", writer).validation
 
 
-def write_slam(path: Path, record: LocalisationRecord) -> None:
-    """Write ``slam.json``; `read_slam` gives it back equal.
+def write_slam(path: Path, record: LocalisationRecord) -> str:
+    """Write ``slam.json`` and return its id; `read_slam` gives it back equal.
 
     Raises
     ------
@@ -136,7 +141,20 @@ def write_slam(path: Path, record: LocalisationRecord) -> None:
     """
     absent = {name for name in ("judgement", "gain", "hints") if not getattr(record, name)}
     file = _SlamFile("l2m-slam", 4, LEGEND, **fields_of(record, LocalisationRecord))
-    _write(path, _SLAM.dump_json(file, exclude=absent))
+    found = report_id(json.loads(_SLAM.dump_json(file, exclude=absent)))
+    _write(path, _SLAM.dump_json(replace(file, id=found), exclude=absent))
+    return found
+
+
+def record_id(path: Path) -> str:
+    """Return the report id of a ``slam.json`` or ``validation.json`` that was read."""
+    return _checked(path, read_content(path, MAX_BYTES, CalibrationError))
+
+
+def _checked(path: Path, raw: bytes) -> str:
+    """Return the report id of a file; a CalibrationError if it carries another."""
+    content: Any = json.loads(raw)
+    return checked_id(path, content, CalibrationError)
 
 
 def read_slam(path: Path) -> LocalisationRecord:
@@ -236,4 +254,5 @@ def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> 
         fault = first_fault(error)
         raise CalibrationError(f"{path}: not a {kind} file of this program: {fault}") from error
     check_set(path, CalibrationError)
+    _checked(path, raw)
     return found

@@ -1,12 +1,12 @@
-"""The results of a run as a set: published together or not at all, and known by one fingerprint.
+"""The results of a run as a set: published together or not at all, known by their digests.
 
 Files are written to a hidden folder beside their places. When all are complete the hidden folder is
 renamed, in one step: from then on they count, and are moved to their places. A run that is killed
 before leaves the old results, one that is killed later leaves what the next run, or whoever reads,
-only has to move. ``results.json`` lists the files with their digests, under one fingerprint.
+only has to move. ``results.json`` lists the files with their digests. What identifies a result is
+the report id in it, see ``report_id``.
 """
 
-import hashlib
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -32,8 +32,7 @@ WAIT_S = 60.0  # for another run that moves its files
 @dataclass(frozen=True)
 class _SetFile(Record):
     format: Literal["l2m-results"]
-    version: Literal[1]
-    fingerprint: str
+    version: Literal[1, 2]  # the first had a fingerprint of the list
     files: dict[str, str]
 
 
@@ -120,9 +119,8 @@ def check_set(path: Path, error: type[L2MError]) -> None:
     if source_file(path).sha256 != listed.files[path.name]:
         others = sorted(name for name in listed.files if name != path.name)
         raise error(
-            f"{path}: is not of the run that {', '.join([SET_FILE, *others])} beside it are of "
-            f"({listed.fingerprint[:8]}), or was edited; run the command again, or put {path.name} "
-            "into a folder of its own"
+            f"{path}: is not of the run that {', '.join([SET_FILE, *others])} beside it are of, "
+            f"or was edited; run the command again, or put {path.name} into a folder of its own"
         )
 
 
@@ -162,14 +160,12 @@ def _digests(stage: Path, unlisted: Sequence[str]) -> dict[str, str]:
 
 
 def _list(stage: Path, files: Mapping[str, str], gone: Collection[str]) -> None:
-    """Write the list of a set, with the fingerprint of all that is in it, and what it replaces."""
+    """Write the list of a set, with the digests of all that is in it, and what it replaces."""
     if not files:
         _write_flushed(stage / GONE, "\n".join(sorted({*gone, SET_FILE})))
         _flush(stage)
         return
-    text = "".join(f"{name}\0{digest}\0" for name, digest in sorted(files.items()))
-    fingerprint = hashlib.sha256(text.encode()).hexdigest()
-    content = _SetFile("l2m-results", 1, fingerprint, dict(sorted(files.items())))
+    content = _SetFile("l2m-results", 2, dict(sorted(files.items())))
     _write_flushed(stage / SET_FILE, f"{_SET.dump_json(content, indent=1).decode()}\n")
     _write_flushed(stage / GONE, "\n".join(sorted(gone)))
     _flush(stage)

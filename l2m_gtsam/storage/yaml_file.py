@@ -115,7 +115,14 @@ class _Representer(SafeRepresenter):
     """Plain values, and enumerations as their text."""
 
 
-_Representer.add_multi_representer(StrEnum, lambda writer, each: writer.represent_str(each.value))
+def _text(writer: SafeRepresenter, text: str) -> Any:
+    """Represent text; in quotes what would be read as something else: `?b`, the control NEL."""
+    style = '"' if text.startswith("?") or "\x85" in text else None
+    return writer.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+_Representer.add_representer(str, _text)
+_Representer.add_multi_representer(StrEnum, lambda writer, each: _text(writer, each.value))
 
 LONGEST = 100  # characters of what is wrong with a file, of a stranger's own words
 MOST_IN_ROW = 64  # numbers, which take less than a line

@@ -36,8 +36,12 @@ def field_map(place: CalibratedYard) -> Path:
 
 
 def changed_file(calibration: Path, path: Path, **changes: object) -> Path:
-    """Write a calibration in which some entries of the sensor are others; None leaves one out."""
+    """Write a calibration in which some entries of the sensor are others; None leaves one out.
+
+    As one that is made by hand: without an id.
+    """
     content = read_yaml(calibration, CalibrationError)
+    del content["id"]
     content["sensors"]["mag"] |= changes
     for key in [key for key, value in changes.items() if value is None]:
         del content["sensors"]["mag"][key]
@@ -176,6 +180,7 @@ def test_bad_input(
     assert "is no covariance matrix" in line(*own, "--compare", crooked)
     content = read_yaml(calibration, CalibrationError)
     content["sensors"] = {"front": content["sensors"]["mag"]}
+    del content["id"]
     write_yaml(tmp_path / "front.yaml", content, "")
     shared = line(*own, "--compare", tmp_path / "front.yaml")
     assert "no sensor that both calibrations know: there are front" in shared

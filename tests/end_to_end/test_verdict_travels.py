@@ -181,7 +181,7 @@ def test_an_old_calibration_counts_as_not_judged(place: CalibratedYard, tmp_path
     """It is read, used and said to be not judged, in one line; a report judges it."""
     yaml: Any = YAML(typ="safe", pure=True)
     content = yaml.load(place.calibration.read_text())
-    del content["verdict"]
+    del content["verdict"], content["id"]
     old, out = tmp_path / "calibration.yaml", tmp_path / "mag.json"
     with old.open("w") as file:
         yaml.dump(content, file)

@@ -1,6 +1,5 @@
 """The report on a calibration: one page that needs nothing else."""
 
-import hashlib
 import json
 from dataclasses import dataclass
 
@@ -18,16 +17,23 @@ from l2m_gtsam.qa.report.figures import readings, statistics
 from l2m_gtsam.qa.report.figures.changes import changes_figure
 from l2m_gtsam.qa.report.figures.comparison import drives_figure
 from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
-from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw, roll_pitch_yaw_sigma
+from l2m_gtsam.qa.report.page import (
+    Identity,
+    Picture,
+    pictures,
+    render,
+    roll_pitch_yaw,
+    roll_pitch_yaw_sigma,
+)
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.calibration import Measured, judge, measured
 from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, place_of, stretch_head
 from l2m_gtsam.qa.verdict.uncertainty import shares_in_words, what_helps
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import Metrics, SensorMetrics
-from l2m_gtsam.records.verdict import Level, SensorVerdict, Verdict
+from l2m_gtsam.records.verdict import SensorVerdict
 from l2m_gtsam.solve.rank import PARAMETERS
-from l2m_gtsam.storage.calibration_file import MODEL, UNCERTAINTY
+from l2m_gtsam.storage.calibration_file import MODEL, UNCERTAINTY, calibration_content
 
 STAGE = "report"
 
@@ -74,7 +80,11 @@ class SensorSection:
 
 
 def calibration_page(
-    result: CalibrationResult, metrics: Metrics, options: QaOptions, progress: Progress = silent
+    result: CalibrationResult,
+    metrics: Metrics,
+    options: QaOptions,
+    progress: Progress = silent,
+    identity: Identity | None = None,
 ) -> str:
     """Return the report on a calibration as HTML.
 
@@ -88,6 +98,8 @@ def calibration_page(
         Thresholds of the verdict.
     progress
         Called with a stage and the fraction of it that is done.
+    identity
+        Of the file that the calibration was written to; absent where it was not.
     """
     report = counter(STAGE, progress)
     steps = len(result.sensors) + 2
@@ -136,19 +148,8 @@ def calibration_page(
             model=MODEL,
             options=json.dumps(result.options, indent=2, ensure_ascii=False),
             earlier=() if result.judgement is None else result.judgement.earlier,
-            fingerprint=_fingerprint(result, verdict, options),
+            identity=identity or Identity(calibration_content(result)["id"]),
         )
-
-
-def _fingerprint(result: CalibrationResult, verdict: Verdict, options: QaOptions) -> str:
-    """Return ten digits of a digest of a calibration's numbers, its verdict and the thresholds."""
-    judged = [*verdict.lines(Level.PASS), options.model_dump_json()]
-    digest = hashlib.sha256("\n".join(judged).encode(errors="surrogatepass"))
-    for sensor in result.sensors:
-        digest.update(sensor.sensor.encode(errors="surrogatepass"))
-        for part in (sensor.t_lidar_mag, sensor.distortion.vector(), sensor.covariance):
-            digest.update(np.ascontiguousarray(part).tobytes())
-    return digest.hexdigest()[:10]
 
 
 def _figures(sensor: SensorCalibration, found: SensorMetrics) -> dict[str, Figure | Drawing]:

@@ -13,7 +13,7 @@ from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.figures import localisation as drive_figures
 from l2m_gtsam.qa.report.figures import readings, statistics
 from l2m_gtsam.qa.report.figures.map import residual_figure
-from l2m_gtsam.qa.report.page import Picture, pictures, render
+from l2m_gtsam.qa.report.page import Identity, Picture, pictures, render
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.localisation import judge_localisation, localisation_thresholds
 from l2m_gtsam.records.localisation_file import LocalisationRecord, RefinedSensor, SensorRecord
@@ -44,7 +44,9 @@ class LocalisationSection:
     pictures: dict[str, Picture]
 
 
-def localisation_page(record: LocalisationRecord, options: QaOptions) -> str:
+def localisation_page(
+    record: LocalisationRecord, options: QaOptions, identity: Identity | None = None
+) -> str:
     """Return the report on a localisation as HTML.
 
     Text from bags is escaped; nothing is loaded from anywhere.
@@ -53,6 +55,8 @@ def localisation_page(record: LocalisationRecord, options: QaOptions) -> str:
     ----------
     options
         Thresholds of the verdict.
+    identity
+        Of the file that it was written to; absent where it was not.
     """
     verdict, path = judge_localisation(record, options), localised_trajectory(record)
     refined = {each.sensor: each for each in record.refined}
@@ -65,6 +69,7 @@ def localisation_page(record: LocalisationRecord, options: QaOptions) -> str:
         return render(
             "localisation.html.j2",
             record=record,
+            identity=identity,
             verdict=verdict,
             path=path,
             median=1e3 * float(np.median(path.position_sigma)),

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, SourceFile
 from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.svg import as_svg
 from l2m_gtsam.records.metrics import Row
+from l2m_gtsam.storage.report_id import SHOWN
 from l2m_gtsam.text.rounded import (
     by_sigma,
     limit,
@@ -40,6 +42,32 @@ class Picture:
     def svg(self, alt: str) -> Markup:
         """Return it as an element of the page; ``alt`` is what it shows."""
         return as_svg(self.figure, self.name, alt)
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a page is of.
+
+    Attributes
+    ----------
+    id
+        SHA-256 of all that the result says, 64 hexadecimal digits.
+    file
+        The file that carries it; absent where nothing was written.
+    """
+
+    id: str
+    file: SourceFile | None = None
+
+    @property
+    def short(self) -> str:
+        """As many digits of the id as are shown where there is no room for all."""
+        return self.id[:SHOWN]
+
+    @property
+    def name(self) -> str:
+        """Name of the file, without where it is."""
+        return "" if self.file is None else Path(self.file.path).name
 
 
 def pictures(figures: Mapping[str, Figure | Drawing], anchor: str = "") -> dict[str, Picture]:

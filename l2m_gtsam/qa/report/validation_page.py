@@ -12,7 +12,7 @@ from l2m_gtsam.qa.report.figures import readings
 from l2m_gtsam.qa.report.figures.changes import changes_figure
 from l2m_gtsam.qa.report.figures.comparison import field_errors_figure, nis_figure
 from l2m_gtsam.qa.report.figures.statistics import sigmas_figure
-from l2m_gtsam.qa.report.page import Picture, pictures, render
+from l2m_gtsam.qa.report.page import Identity, Picture, pictures, render
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, place_of
 from l2m_gtsam.qa.verdict.validation import NAMES, amount
@@ -53,15 +53,21 @@ class ValidationSection:
     pictures: dict[str, Picture]
 
 
-def validation_page(found: Validation) -> str:
+def validation_page(found: Validation, identity: Identity | None = None) -> str:
     """Return a validation as HTML.
 
     Text from bags is escaped; nothing is loaded from anywhere.
+
+    Parameters
+    ----------
+    identity
+        Of the file that it was written to; absent where it was not.
     """
     with mpl.rc_context(SETTINGS):
         return render(
             "validation.html.j2",
             found=found,
+            identity=identity,
             verdict=found.verdict,
             sections=[_section(k, each, found) for k, each in enumerate(found.verdict.sensors)],
             pictures={} if found.drive is None else pictures(_figures(found.drive)),

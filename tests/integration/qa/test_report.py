@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -100,6 +101,7 @@ def test_what_was_just_written_is_reported_without_being_read(
 
     And the same refusal beside a localisation.
     """
+    shutil.copy(made.folder / CALIBRATION_FILE, tmp_path)
     found = EvaluatedCalibration(read_calibration(made.folder / CALIBRATION_FILE), made.metrics)
     assert report_calibration(tmp_path, found, QaOptions()).level is reported[0]
     assert (tmp_path / REPORT_FILE).read_text() == reported[1]

@@ -26,6 +26,7 @@ def without(path: Path, explanation: str) -> list[tuple[str, Any]]:
     text = path.read_text(encoding="utf-8")
     content = json.loads(text) if path.suffix == ".json" else YAML(typ="safe", pure=True).load(text)
     assert content.pop(explanation)
+    content.pop("id", None)  # which no file of an earlier version carries
     return flat(content)
 
 

@@ -1,4 +1,4 @@
-"""Results as a set: all or none, known by one fingerprint, refused when they are mixed."""
+"""Results as a set: all or none, known by their digests, refused when they are mixed."""
 
 import json
 import shutil
@@ -160,3 +160,16 @@ def test_names_outside_are_not_removed(tmp_path: Path) -> None:
     assert precious.exists()
     assert not ready.exists()
     assert there(out) == dict.fromkeys(NAMES, "old")
+
+
+def test_a_list_of_an_earlier_version_is_read(tmp_path: Path) -> None:
+    """It had a fingerprint of its own, which nothing is known by any more."""
+    write(tmp_path, "old")
+    listed = json.loads((tmp_path / SET_FILE).read_text())
+    assert sorted(listed) == ["files", "format", "version"]
+    former = {**listed, "version": 1, "fingerprint": "1" * 64}
+    (tmp_path / SET_FILE).write_text(json.dumps(former))
+    check_set(tmp_path / "a.txt", CalibrationError)
+    (tmp_path / "a.txt").write_text("new")
+    with pytest.raises(CalibrationError, match="is not of the run"):
+        check_set(tmp_path / "a.txt", CalibrationError)
