@@ -310,8 +310,36 @@ class Readings:
 
 
 @dataclass(frozen=True)
+class SaturatedAxis:
+    """A limit of a sensor's range that readings exceed.
+
+    Attributes
+    ----------
+    axis
+        "x", "y" or "z" of the sensor.
+    limit
+        The value that is reported beyond it, uT.
+    readings, of
+        How many readings at different places have it, and how many there are.
+    """
+
+    axis: str
+    limit: float
+    readings: int
+    of: int
+
+    @property
+    def share(self) -> float:
+        """Share of the readings at the limit."""
+        return self.readings / self.of
+
+
+@dataclass(frozen=True)
 class SyncCounts:
-    """How many readings of one sensor were kept and why the others were not."""
+    """How many readings of one sensor were kept and why the others were not.
+
+    ``limits`` are those of its range that the ``saturated`` readings exceed.
+    """
 
     received: int
     not_finite: int
@@ -321,6 +349,8 @@ class SyncCounts:
     thinned: int
     kept: int
     without_regressor: int = 0
+    saturated: int = 0
+    limits: tuple[SaturatedAxis, ...] = ()
 
 
 @dataclass(frozen=True)

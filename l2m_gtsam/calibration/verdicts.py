@@ -301,11 +301,12 @@ def _why_silent(usable: int, counts: SyncCounts, moved: Movement, needed: int) -
     reason = f"{moved.rest}: " if moved.at_rest else ""
     without = counts.without_regressor
     numbers = f", {without} without a recorded number" if without else ""
+    beyond = f", {counts.saturated} beyond its range" if counts.saturated else ""
     return (
         f"{reason}{usable} usable readings of {counts.received} received "
         f"({counts.not_finite} not finite, {counts.repeated} repeated, "
         f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap between poses, "
-        f"{counts.thinned} at a place already read{numbers}), at least {needed} are needed"
+        f"{counts.thinned} at a place already read{numbers}{beyond}), at least {needed} are needed"
     )
 
 

@@ -22,6 +22,7 @@ from l2m_gtsam.maps.training import checked_readings
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
+from l2m_gtsam.recording.saturation import saturation_doubts
 from l2m_gtsam.recording.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
 
 
@@ -37,12 +38,15 @@ class SurveyReadings:
         What errors of the sensors do to that.
     poses
         What errors of the poses do to that; absent where they count as exact.
+    doubts
+        What speaks against the readings, a sentence each.
     """
 
     points: FloatArray
     field: FloatArray
     suite: SuiteErrors
     poses: SurveyPoses | None = None
+    doubts: tuple[str, ...] = ()
 
     def followed_by(self, other: "SurveyReadings") -> "SurveyReadings":
         """Return these readings and others."""
@@ -51,6 +55,7 @@ class SurveyReadings:
             np.concatenate([self.field, other.field]),
             self.suite.followed_by(other.suite, len(self.points)),
             errors_together(self.poses, other.poses, len(self.points)),
+            self.doubts + other.doubts,
         )
 
 
@@ -88,7 +93,7 @@ def map_recordings(
     read = suite_readings(recordings, suite, options.sync, options.pose_noise)
     field_map = build_map(read.points, read.field, options.model, cloud, read.suite, read.poses)
     if isinstance(field_map, HarmonicMap):
-        field_map = field_map.doubted(steady.doubts)
+        field_map = field_map.doubted((*steady.doubts, *read.doubts))
     # Errors that are stated or found are counted; sensors that count as exact have to look like it.
     if isinstance(field_map, HarmonicMap) and field_map.learnt.suite is None:
         return field_map.doubted(suite_doubts(recordings, suite, options.suite))
@@ -121,7 +126,8 @@ def update_map(
     steady = steady_survey(recordings, suite, options.suite)
     read = suite_readings(steady.recordings, suite, options.sync, options.pose_noise)
     if isinstance(field_map, HarmonicMap):
-        return field_map.updated(read.points, read.field, read.suite, read.poses)
+        updated = field_map.updated(read.points, read.field, read.suite, read.poses)
+        return updated.doubted(read.doubts)
     return field_map.updated(read.points, read.field)
 
 
@@ -183,12 +189,15 @@ def suite_readings(
     for recording in recordings:
         known = [_known(series.sensor, suite, recording) for series in recording.series]
         offset = np.array([each.time_offset for each in known])
-        readings = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0))).readings
+        synchronised = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0)))
+        readings = synchronised.readings
         _refuse_stuck(readings, recording)
         readings = with_offsets(readings, recording.trajectory, offset)
         points, field = sensor_positions(readings, known), map_fields(readings, known)
         poses = survey_poses(recording.trajectory, readings, points, field, pose_noise)
-        drives.append(SurveyReadings(points, field, suite_errors(readings, known), poses))
+        doubts = saturation_doubts(readings.sensors, synchronised.counts)
+        errors = suite_errors(readings, known)
+        drives.append(SurveyReadings(points, field, errors, poses, doubts))
     read = reduce(SurveyReadings.followed_by, drives)
     checked_readings(read.points, read.field)
     return read

@@ -24,6 +24,7 @@ from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
+from l2m_gtsam.recording.saturation import saturation_doubts
 from l2m_gtsam.recording.sync import stuck_sensors, synchronise, with_offsets
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
@@ -284,7 +285,10 @@ def _result(
         sensors=sensors,
         iterations=solution.rounds,
         uncertainty=Uncertainty.FULL,
-        doubts=_doubts(drive.readings.sensors, solution, options),
+        doubts=(
+            *_doubts(drive.readings.sensors, solution, options),
+            *saturation_doubts(drive.readings.sensors, drive.counts),
+        ),
         disagreements=(),
         bag=None if recording.drives else recording.source,
         map=None,

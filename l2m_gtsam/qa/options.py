@@ -60,7 +60,7 @@ class Nominal(Options):
 class ValidationOptions(Options):
     """Thresholds of the verdict of `l2m validate`.
 
-    It shares `qa.unexplained`, `qa.rejected` and `qa.outside_map` with the report.
+    It shares `qa.unexplained`, `qa.rejected`, `qa.outside_map` and `qa.saturated` with the report.
     """
 
     chance: float = Field(default=1e-3, gt=0, lt=0.1)
@@ -142,6 +142,8 @@ class QaOptions(Options):
     """Share of the readings inside the map that no distortion explains."""
     outside_map: Limit = Limit(warn=0.3, fail=0.9)
     """Share of the readings for which the map has no data."""
+    saturated: Limit = Limit(warn=0.001, fail=0.1)
+    """Share of the readings along an axis that are beyond the range of the sensor."""
     halves_chance: float = Field(default=1e-3, gt=0, lt=0.1)
     """Share of sound sensors whose halves of the drive may differ in t, C or H by chance."""
     halves_apart: Limit = Limit(warn=1.0, fail=2.0)

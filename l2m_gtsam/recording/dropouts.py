@@ -1,10 +1,19 @@
-"""Dropouts: times in which a magnetometer repeats one value or sends nothing. Pure."""
+"""Times in which a magnetometer repeats one value, is out of its range or silent. Pure."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FieldSeries, FloatArray, IntArray, Recording, Trajectory
+from l2m_gtsam.data import (
+    BoolArray,
+    FieldSeries,
+    FloatArray,
+    IntArray,
+    Recording,
+    SaturatedAxis,
+    Trajectory,
+)
+from l2m_gtsam.recording.saturation import is_saturated, saturated_axes, saturation_sentence
 from l2m_gtsam.recording.sync import STUCK_UT, interpolated
 
 # So many readings that are identical while the vehicle moves so far, or turns so much.
@@ -22,9 +31,9 @@ class MaskedRecording:
     Attributes
     ----------
     recording
-        Its readings, NaN where a sensor repeats one value.
+        Its readings, NaN where a sensor repeats one value or its range is exceeded.
     notes
-        One sentence for each sensor with dropouts.
+        A sentence for each sensor with dropouts, and for each whose range is exceeded.
     """
 
     recording: Recording
@@ -32,16 +41,35 @@ class MaskedRecording:
 
 
 def mask_dropouts(recording: Recording) -> MaskedRecording:
-    """Mask readings that a sensor repeats while the vehicle moves, as NaN."""
+    """Mask readings that a sensor repeats while the vehicle moves, or beyond its range, as NaN."""
     trajectory = recording.trajectory
-    series = tuple(_alive(each, trajectory) for each in recording.series)
-    notes = [_note(each, trajectory) for each in series]
+    alive = [_alive(each, trajectory) for each in recording.series]
+    limits = [saturated_axes(_finite(each)) for each in alive]
+    series = tuple(map(_within_range, alive, limits))
+    notes = [_note(each, trajectory) for each in alive]
+    notes += [
+        f"{each.sensor}: {saturation_sentence(own)}"
+        for each, own in zip(series, limits, strict=True)
+        if own
+    ]
     return MaskedRecording(replace(recording, series=series), tuple(note for note in notes if note))
 
 
 def is_dead(series: FieldSeries) -> bool:
     """Return whether a sensor has no reading at all."""
     return not np.isfinite(series.field).all(axis=1).any()
+
+
+def _finite(series: FieldSeries) -> FloatArray:
+    return series.field[np.isfinite(series.field).all(axis=1)]
+
+
+def _within_range(series: FieldSeries, limits: tuple[SaturatedAxis, ...]) -> FieldSeries:
+    """Return the same, NaN where readings are at limits of the range."""
+    if not limits:
+        return series
+    beyond = is_saturated(series.field, limits)
+    return replace(series, field=np.where(beyond[:, None], np.nan, series.field))
 
 
 def _alive(series: FieldSeries, trajectory: Trajectory) -> FieldSeries:

@@ -7,7 +7,7 @@ clocks need not be continuous from one drive to the next.
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -26,6 +26,7 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.recording.saturation import limits_together
 
 # Between drives. Longer than any pause that is looked for in readings, and than any time offset.
 PAUSE_NS = 60_000_000_000
@@ -281,8 +282,16 @@ def _regressors(readings: Sequence[Readings]) -> FloatArray | None:
 def _counts(name: str, parts: Sequence[Synchronised]) -> SyncCounts:
     """Return the account of a sensor's readings in all drives."""
     own = [
-        vars(each.counts[each.readings.sensors.index(name)])
+        each.counts[each.readings.sensors.index(name)]
         for each in parts
         if name in each.readings.sensors
     ]
-    return SyncCounts(**{field: sum(each[field] for each in own) for field in own[0]})
+    limits = limits_together([each.limits for each in own], [_looked_at(each) for each in own])
+    numbers = [field.name for field in fields(SyncCounts) if field.name != "limits"]
+    sums = {name: sum(getattr(each, name) for each in own) for name in numbers}
+    return SyncCounts(**sums, limits=limits)
+
+
+def _looked_at(counts: SyncCounts) -> int:
+    """Return how many readings of a drive were looked at for limits of the range."""
+    return counts.limits[0].of if counts.limits else counts.kept + counts.without_regressor

@@ -21,6 +21,7 @@ from l2m_gtsam.data import (
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.geometry import interpolated_rotations
 from l2m_gtsam.options import Options
+from l2m_gtsam.recording.saturation import is_saturated, saturated_axes
 
 
 class SyncOptions(Options):
@@ -60,6 +61,10 @@ def synchronise(
     ------
     SyncError
         No reading of any sensor lies within the time of the trajectory.
+
+    Notes
+    -----
+    Readings beyond the range of their sensor do not count: an axis of them is not what it says.
     """
     parts, counts = [], []
     for index, series in enumerate(recording.series):
@@ -68,7 +73,7 @@ def synchronise(
         )
         parts.append(readings)
         counts.append(count)
-    if not any(count.kept for count in counts):
+    if not any(count.kept or count.saturated for count in counts):
         raise SyncError(_nothing_left(recording, options, largest_offset_s))
     return Synchronised(_concatenate(recording, parts), tuple(counts))
 
@@ -85,6 +90,11 @@ def _synchronise_one(
     keep = fresh & spanned & near
     readings = _with_poses(trajectory, index, series.stamp_ns[keep], series.field[keep])
     new = _first_in_cell(readings, options)
+    limits = saturated_axes(readings.field[new])
+    beyond = is_saturated(readings.field, limits)
+    if limits:
+        readings = readings.select(~beyond)
+        new = _first_in_cell(readings, options)
     counts = SyncCounts(
         received=len(series),
         not_finite=int(np.sum(~finite)),
@@ -93,6 +103,8 @@ def _synchronise_one(
         in_pose_gap=int(np.sum(fresh & spanned & ~near)),
         thinned=int(np.sum(~new)),
         kept=int(np.sum(new)),
+        saturated=int(np.sum(beyond)),
+        limits=limits,
     )
     return readings.select(new), counts
 

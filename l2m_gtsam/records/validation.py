@@ -10,6 +10,7 @@ from typing import Annotated
 
 from pydantic import AliasChoices, Field
 
+from l2m_gtsam.data import SaturatedAxis
 from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Row, Series
 from l2m_gtsam.records.places import ChangedSource, WhatChanged
 from l2m_gtsam.records.record import Record
@@ -156,6 +157,8 @@ class ValidatedSensor(Record):
         What the drive would have shown.
     series
         The course of the drive, thinned.
+    limits
+        Of its range, that readings exceed; these do not count.
     """
 
     sensor: str
@@ -179,6 +182,7 @@ class ValidatedSensor(Record):
         ),
     ]
     series: Series
+    limits: tuple[SaturatedAxis, ...] = ()
 
     @property
     def unexplained(self) -> float:

@@ -79,6 +79,11 @@ MODEL = {
         "twice the log of the likelihood ratio; explanations: what a change of the place, of the "
         "moment, of the vehicle or of one sensor explains there, the best first"
     ),
+    "readings": (
+        "how many there were and why others do not count; where the range is exceeded: limits, the "
+        "value in uT that is reported beyond it along an axis, of how many readings; saturated: "
+        "those that do not count for that"
+    ),
     "from_priors": (
         "what the readings leave open and only `calibration.priors` determine, or mostly (sigmas "
         "without them would be more than twice as large): parameters, and what was known of them"
@@ -273,6 +278,8 @@ def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
     }
     if sensor.unmodelled == EXPLAINED:
         values["unmodelled"] = None
+    for name in ("saturated", "limits"):
+        values["readings"] = _without_empty(values["readings"], name)
     entry = {key: values[key] for key in SENSOR_KEYS}
     for name in ("missing_in", "unmodelled", "variance_shares", "common"):
         entry = _without_empty(entry, name)

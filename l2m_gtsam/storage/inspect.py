@@ -10,6 +10,7 @@ from rosbags.interfaces import Connection
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.progress import Count
+from l2m_gtsam.recording.saturation import saturated_axes, saturation_sentence
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps
 from l2m_gtsam.storage.bag_report import POSE_FILE, BagReport, TopicReport
 from l2m_gtsam.storage.field_types import (
@@ -276,10 +277,20 @@ def _field_use(
     if not np.isfinite(written).all(axis=1).any():
         return f"{use}, but none is finite: the sensor is dead"
     if found.is_alive:
-        return use
+        return f"{use}{_beyond_range(found, options)}"
     constant = written[np.isfinite(written).all(axis=1)][0]
     text = ", ".join(f"{value:.4g}" for value in constant)
     size = float(np.linalg.norm(constant)) * microtesla_per(options.units, own)
     low, high = PLAUSIBLE_UT
     no_field = "" if low <= size <= high else f", and {size:.3g} uT is no field on Earth"
     return f"{use}, but all are ({text}) as written: the sensor is stuck{no_field}"
+
+
+def _beyond_range(found: TopicContent, options: BagOptions) -> str:
+    """Return which limits of its range the readings of a topic exceed; empty if none."""
+    written, own = found.readings.field(), found.readings.unit
+    if own is None and options.units is Unit.AUTO:
+        return ""
+    field = written[np.isfinite(written).all(axis=1)] * microtesla_per(options.units, own)
+    limits = saturated_axes(field)
+    return f", but {saturation_sentence(limits)}" if limits else ""

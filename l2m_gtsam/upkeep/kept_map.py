@@ -169,7 +169,7 @@ def after_drive(
             "they are; see `l2m validate`, and calibrate them anew"
         )
     found = dated_changes(field_map, seen.sources, diary)
-    return renewed(field_map, drive_readings(read, drive), found, survey)
+    return renewed(field_map, drive_readings(read, drive), found, survey).doubted(read.doubts)
 
 
 def drive_readings(read: SurveyReadings, drive: MapDrive) -> DriveReadings:

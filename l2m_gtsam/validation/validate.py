@@ -1,6 +1,6 @@
 """Recording + map + calibration -> how far the calibration still holds. Pure: no files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from l2m_gtsam.data import (
     FloatArray,
     Readings,
     Recording,
+    SaturatedAxis,
     SourceFile,
     same_content,
 )
@@ -24,6 +25,7 @@ from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
 from l2m_gtsam.qa.metrics.changes import is_calibrated
 from l2m_gtsam.qa.metrics.coverage import drive_metrics
 from l2m_gtsam.recording.drive_trace import is_of
+from l2m_gtsam.recording.saturation import saturation_sentence
 from l2m_gtsam.recording.sync import stuck_sensors
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.validation import (
@@ -137,6 +139,8 @@ class _Test:
         The map, ready to be asked often.
     stuck
         Names of sensors that report one value.
+    limits
+        Of the range of each sensor, that readings exceed.
     options, chance
         As of `validate`.
     thinning
@@ -147,6 +151,7 @@ class _Test:
     readings: Readings
     field_map: QueryableMap
     stuck: frozenset[str]
+    limits: Mapping[str, tuple[SaturatedAxis, ...]]
     options: CalibrationOptions
     chance: float
     thinning: Thinning
@@ -162,12 +167,15 @@ def _test_of(
     """Return what sensors that are known are tested on; others take no part."""
     shared = {each.sensor for each in known}
     kept = tuple(each for each in recording.series if each.sensor in shared)
-    readings = prepare(replace(recording, series=kept), options).readings
+    synchronised = prepare(replace(recording, series=kept), options)
+    readings = synchronised.readings
+    pairs = zip(readings.sensors, synchronised.counts, strict=True)
     return _Test(
         recording=recording,
         readings=readings,
         field_map=for_solvers(field_map),
         stuck=frozenset(readings.sensors[k] for k in stuck_sensors(readings)),
+        limits={name: counts.limits for name, counts in pairs},
         options=options,
         chance=chance,
         thinning=Thinning(
@@ -253,11 +261,14 @@ def _of_all(test: _Test, known: Sequence[SensorCalibration]) -> tuple[Readings, 
 def _tested(test: _Test, sensor: SensorCalibration) -> ValidatedSensor | NotValidated:
     """Return one sensor tested on the drive, or why it cannot be."""
     drive, options = drive_of(test.readings, test.recording, sensor), test.options
+    limits = test.limits[sensor.sensor]
     if reason := _why_untested(drive, test.field_map, sensor, options, sensor.sensor in test.stuck):
-        return NotValidated(sensor.sensor, reason, faulty=True)
+        beyond = f"{saturation_sentence(limits)}. " if limits else ""
+        return NotValidated(sensor.sensor, f"{beyond}{reason}", faulty=True)
     known, covariance = _known(test.recording, sensor), joint_covariance(sensor)
     found = recheck(drive, test.field_map, known, covariance, options.solve, test.chance)
-    return sensor_figures(drive, test.field_map, sensor, found, test.thinning)
+    figures = sensor_figures(drive, test.field_map, sensor, found, test.thinning)
+    return replace(figures, limits=limits)
 
 
 def drive_of(readings: Readings, recording: Recording, sensor: SensorCalibration) -> SensorDrive:

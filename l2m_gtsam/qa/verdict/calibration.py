@@ -10,7 +10,16 @@ from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.verdict.mounting import mounting
 from l2m_gtsam.qa.verdict.places import source_reasons, stretch_head, stretch_tail
 from l2m_gtsam.qa.verdict.repeatability import furthest, repeat
-from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, Case, clock, ending, fit, misfit, precision
+from l2m_gtsam.qa.verdict.sensor import (
+    WRONG_MAP,
+    Case,
+    clock,
+    ending,
+    fit,
+    misfit,
+    precision,
+    saturation,
+)
 from l2m_gtsam.qa.verdict.uncertainty import disturbance_reasons, stated_wrongly
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
@@ -183,8 +192,18 @@ def _lower_bounds(case: Case) -> list[Reason]:
 
 
 # In the order in which a person would ask; the worst come first in the end.
-RULES = (repeat, ending, mounting, fit, _own_stretches, clock, precision, _lower_bounds)
-RULES_OF_A_MISFIT = (fit, ending)
+RULES = (
+    saturation,
+    repeat,
+    ending,
+    mounting,
+    fit,
+    _own_stretches,
+    clock,
+    precision,
+    _lower_bounds,
+)
+RULES_OF_A_MISFIT = (saturation, fit, ending)
 
 
 @dataclass(frozen=True)
@@ -249,6 +268,7 @@ def measured(
             options.outside_map,
             100,
         ),
+        _in("beyond the range", "%", _beyond_range(sensor), options.saturated, 100),
     )
     return tuple(each for each in every if not np.isnan(each.value))
 
@@ -259,6 +279,11 @@ def _in(name: str, unit: str, value: float, limit: Limit, factor: float = 1.0) -
 
 def _largest(sigmas: FloatArray) -> float:
     return float(sigmas.max())
+
+
+def _beyond_range(sensor: SensorCalibration) -> float:
+    """Return the share of readings beyond the range along the worst axis; NaN if there are none."""
+    return max((each.share for each in sensor.sync.limits), default=float("nan"))
 
 
 def _share(part: int, whole: int) -> float:

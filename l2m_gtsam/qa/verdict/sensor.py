@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, SaturatedAxis
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.recording.saturation import saturation_sentence
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     SensorCalibration,
@@ -58,6 +59,19 @@ class Case:
     def others(self) -> tuple[SensorMetrics, ...]:
         """Figures of the other solved sensors."""
         return tuple(each for each in self.all.sensors if each.sensor != self.sensor.sensor)
+
+
+def saturation(case: Case) -> list[Reason]:
+    """Return that readings are beyond the range of the sensor."""
+    return beyond_range(case.sensor.sync.limits, case.options)
+
+
+def beyond_range(limits: Sequence[SaturatedAxis], options: QaOptions) -> list[Reason]:
+    """Return that readings are beyond limits of a sensor's range, if there are any."""
+    if not limits:
+        return []
+    share = max(each.share for each in limits)
+    return options.saturated.reasons(share, f"{saturation_sentence(limits)}.")
 
 
 def ending(case: Case) -> list[Reason]:

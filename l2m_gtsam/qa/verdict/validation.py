@@ -6,7 +6,7 @@ import numpy as np
 
 from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions, thresholds
 from l2m_gtsam.qa.verdict.places import source_reasons
-from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, outside_map
+from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, beyond_range, outside_map
 from l2m_gtsam.records.validation import (
     CalibrationChange,
     CalibrationComparison,
@@ -19,7 +19,7 @@ from l2m_gtsam.records.validation import (
 from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict
 from l2m_gtsam.text.rounded import in_unit, significant, with_sigma
 
-SHARED_LIMITS = ("unexplained", "rejected", "outside_map")
+SHARED_LIMITS = ("unexplained", "rejected", "outside_map", "saturated")
 EXPECTED_TIMES = 2.0  # a refit that leaves no more than this of what is expected fits the map
 NAMES = {
     CalibrationPart.PLACE: "its place t",
@@ -113,13 +113,14 @@ def _misfit(sensor: ValidatedSensor, options: QaOptions) -> bool:
 
 
 def _on_sensor(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
+    beyond = beyond_range(sensor.limits, options)
     if _misfit(sensor, options):
         text = (
             f"Whatever C and H are, the map leaves {significant(sensor.refitted, 2)} µT of its "
             f"readings, a field that is the same everywhere {significant(sensor.uniform, 2)} µT: "
             "the map does not fit what it reads here."
         )
-        return [Reason(Level.FAIL, text)]
+        return [*beyond, Reason(Level.FAIL, text)]
     rules: tuple[Callable[[ValidatedSensor, QaOptions], list[Reason]], ...] = (
         _changed,
         _consistent,
@@ -127,7 +128,7 @@ def _on_sensor(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
         _blind,
         _ending,
     )
-    return [reason for rule in rules for reason in rule(sensor, options)]
+    return [*beyond, *(reason for rule in rules for reason in rule(sensor, options))]
 
 
 def _changed(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
