@@ -186,7 +186,8 @@ class QaOptions(Options):
     """A drive that leaves something open, or known too little, and took a smaller share of all
     headings is called straight."""
     halves: bool = True
-    """Whether both halves of a drive are calibrated by themselves."""
+    """Whether both halves of a drive, or several drives, are calibrated by themselves, and
+    judged."""
     half_readings: int = Field(default=50, ge=30)
     """Readings of each sensor that a half is calibrated on, spread evenly over it, where more of
     them were rejected than `rejected` allows, and that drives are compared with."""

@@ -144,6 +144,7 @@ def calibration_page(
             strongest_correlation=statistics.strongest_correlation,
             thresholds=thresholds(options),
             parameters=PARAMETERS,
+            repeatability="" if options.halves else " Not judged (qa.halves).",
             uncertainty=UNCERTAINTY[result.uncertainty],
             model=MODEL,
             options=json.dumps(result.options, indent=2, ensure_ascii=False),

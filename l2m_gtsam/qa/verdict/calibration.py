@@ -1,6 +1,6 @@
 """The verdict on a calibration: PASS, WARN or FAIL, with reasons in plain sentences."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.verdict.mounting import mounting
 from l2m_gtsam.qa.verdict.places import source_reasons, stretch_head, stretch_tail
-from l2m_gtsam.qa.verdict.repeatability import furthest, repeat
+from l2m_gtsam.qa.verdict.repeatability import furthest_shown, repeat
 from l2m_gtsam.qa.verdict.sensor import (
     WRONG_MAP,
     Case,
@@ -218,6 +218,8 @@ class Measured:
         As it was measured; infinite where it is not determined.
     warn, fail
         Where the verdict changes.
+    passes
+        Why it passes although it is above a limit, as a phrase; else empty.
     """
 
     name: str
@@ -225,11 +227,13 @@ class Measured:
     value: float
     warn: float
     fail: float
+    passes: str = ""
 
     @property
     def level(self) -> Level:
         """What it leads to by itself."""
-        return Limit(warn=self.warn, fail=self.fail).level(self.value)
+        by_value = Limit(warn=self.warn, fail=self.fail).level(self.value)
+        return Level.PASS if self.passes else by_value
 
 
 def measured(
@@ -248,17 +252,16 @@ def measured(
     inside = used + sensor.rejected
     turned = np.rad2deg(np.sqrt(np.diag(sensor.rotation_covariance)))
     chi2 = np.nan if sensor.residuals is None else sensor.residuals.chi2_per_dof
+    apart, passes = furthest_shown(found.halves, options)
     every = (
         _in("sigma of t", "mm", _largest(sensor.t_sigma), options.position_sigma_m, 1e3),
         _in("sigma of rotation", "°", _largest(turned), options.rotation_sigma_deg),
         _in("sigma of H", "µT", _largest(sensor.H_sigma), options.hard_iron_sigma_ut),
         _in("unexplained by the map", "", found.fit.unexplained, options.unexplained),
         _in("chi-square", "", chi2, options.chi_square),
-        _in(
-            "halves apart, over what chance allows",
-            "",
-            furthest(found.halves, options),
-            options.halves_apart,
+        replace(
+            _in("halves apart, over what chance allows", "", apart, options.halves_apart),
+            passes=passes,
         ),
         _in("rejected", "%", _share(sensor.rejected, inside), options.rejected, 100),
         _in(

@@ -23,7 +23,7 @@ JUDGED = (SensorStatus.SOLVED, SensorStatus.CONTRADICTED, SensorStatus.NOT_CONVE
 
 def repeat(case: Case) -> list[Reason]:
     """Return by how much parts differ, where they do, and which cannot be looked at."""
-    if case.metrics is None or case.sensor.status not in JUDGED:
+    if case.metrics is None or case.sensor.status not in JUDGED or not case.options.halves:
         return []
     notes = _not_looked_at(case.metrics)
     halves = differing(case.metrics, case.options)
@@ -42,16 +42,40 @@ def halves_agree(halves: Halves, options: QaOptions) -> bool:
 def furthest(halves: Halves, options: QaOptions) -> float:
     """Return how far halves are apart in t, C or H, over what chance allows; NaN without any.
 
-    What is negligible counts as nothing.
+    What is negligible counts as nothing; `qa.halves` leaves the comparison out.
     """
-    if not halves.distances:
+    if not halves.distances or not options.halves:
         return float("nan")
-    return max(_apart(each, halves, options) for each in halves.distances)
+    return max(_judged(each, halves, options) for each in halves.distances)
+
+
+def furthest_shown(halves: Halves, options: QaOptions) -> tuple[float, str]:
+    """Return how far halves are apart, over what chance allows, and why it passes nevertheless.
+
+    That is said, as a phrase, where it would warn but what it is of is negligible.
+    """
+    judged, limit = furthest(halves, options), options.halves_apart.warn
+    if not judged <= limit:
+        return judged, ""
+    ratios = {each.name: _apart(each, halves, options) for each in halves.distances}
+    small = [name for name, ratio in ratios.items() if ratio > limit]
+    passes = f"{', '.join(_under(name, options) for name in small)}, passes" if small else ""
+    return max(ratios.values()), passes
+
+
+def _under(name: str, options: QaOptions) -> str:
+    """Return what a difference is less than, as a phrase."""
+    t, H = f"{1e3 * options.halves_m:g} mm", f"{options.halves_ut:g} µT"
+    alone = {"t": t, "C": f"{options.halves_deg:g}°", "H": H}
+    return f"{name} under {alone.get(name, f'{t}, {options.halves_deg:g}° and {H}')}"
+
+
+def _judged(found: GroupDistance, halves: Halves, options: QaOptions) -> float:
+    negligible = _negligible(found.name, halves, options)
+    return 0.0 if negligible else _apart(found, halves, options)
 
 
 def _apart(found: GroupDistance, halves: Halves, options: QaOptions) -> float:
-    if _negligible(found.name, halves, options):
-        return 0.0
     return float((found.chi_square / limit_of(found, halves, options)) ** 0.5)
 
 
@@ -126,8 +150,8 @@ def _difference(halves: Halves, where: str, options: QaOptions) -> str:
 def _beyond(halves: Halves, options: QaOptions) -> str:
     """Return in which of t, C and H sigmas do not explain a difference, and by how much."""
     worst = sorted(
-        (each for each in halves.distances if _apart(each, halves, options) > 1),
-        key=lambda each: -_apart(each, halves, options),
+        (each for each in halves.distances if _judged(each, halves, options) > 1),
+        key=lambda each: -_judged(each, halves, options),
     )
     listed = ", ".join(
         f"{each.name} (chi-square {each.chi_square:.0f} of {each.freedom}, limit "

@@ -17,7 +17,7 @@ from l2m_gtsam.qa.metrics.mounting import axis_order, gains, skews_deg
 from l2m_gtsam.qa.metrics.plain import evenly
 from l2m_gtsam.qa.metrics.repeatability import PartialEstimate, compare_halves, no_halves
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.verdict.repeatability import furthest, halves_agree
+from l2m_gtsam.qa.verdict.repeatability import furthest, furthest_shown, halves_agree
 from l2m_gtsam.records.metrics import Halves
 from l2m_gtsam.storage.record_files import read_metrics
 
@@ -179,6 +179,41 @@ def test_t_c_and_h_are_judged_apart(name: str, at: int, by: float) -> None:
     limit = chi2.ppf(1 - 1e-6 / 3, groups[name].freedom)
     assert furthest(found, options) == pytest.approx(np.sqrt(100 / limit))
     assert not halves_agree(found, options)
+
+
+def halves_apart(t_m: float, H_ut: float) -> Halves:
+    """Return halves that differ by so much in t and H, and by nothing in C, sigmas all alike."""
+    vector = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
+    other = vector.copy()
+    other[[0, 12]] += t_m, H_ut
+    S = np.diag(np.repeat([1e-4, 1e-4, 1e-2], [3, 9, 3]) ** 2) / 2  # of each half
+    return compare_halves(PartialEstimate(vector, S), PartialEstimate(other, S))
+
+
+@pytest.mark.parametrize(
+    ("t_m", "H_ut", "limited", "passes"),
+    [
+        (2e-4, 0.0, 2.0, ""),  # within chance: nothing to tolerate
+        (2e-3, 0.0, 20.0, "t under 3 mm, passes"),
+        (2e-3, 0.2, 20.0, "t under 3 mm, H under 0.3 µT, passes"),
+        (2e-3, 0.5, 50.0, ""),  # H is not negligible: it decides, and nothing passes
+    ],
+)
+def test_a_difference_below_the_tolerance_is_shown_as_it_is(
+    t_m: float, H_ut: float, limited: float, passes: str
+) -> None:
+    options = QaOptions()
+    limit = chi2.ppf(1 - options.halves_chance / 3, 3)
+    ratio, phrase = furthest_shown(halves_apart(t_m, H_ut), options)
+    assert ratio == pytest.approx(limited / np.sqrt(limit))
+    assert phrase == passes
+
+
+def test_halves_that_are_not_asked_for_are_not_judged() -> None:
+    found, off = halves_apart(0.05, 5.0), QaOptions(halves=False)
+    assert not halves_agree(found, QaOptions())
+    assert halves_agree(found, off)
+    assert np.isnan(furthest_shown(found, off)[0])
 
 
 def test_halves_of_an_older_file_are_judged_together() -> None:
