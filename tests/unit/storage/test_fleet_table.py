@@ -91,7 +91,7 @@ def test_a_failed_drive_is_a_row_with_its_reason(tmp_path: Path) -> None:
     failed = FleetRow("truck", "b.bag", "truck/b", "", 0.0, None, "b.bag: truncated")
     write_csv(tmp_path / "f.csv", [failed])
     header, line = (tmp_path / "f.csv").read_text().splitlines()
-    assert line.startswith("truck,b.bag,,,error,b.bag: truncated,")
+    assert line.startswith("truck,b.bag,,,error,,b.bag: truncated,")
     assert header.count(",") == line.count(",")
 
 

@@ -33,8 +33,7 @@ def test_a_list_says_how_well_sensors_are_known(tmp_path: Path) -> None:
 
 
 def test_a_calibration_is_read_as_one(tmp_path: Path) -> None:
-    whole = calibration(sensor("a"))
-    write_calibration(tmp_path / "calibration.yaml", whole)
+    whole = write_calibration(tmp_path / "calibration.yaml", calibration(sensor("a")))
     assert_equal(read_sensors(tmp_path / "calibration.yaml"), whole)
 
 
