@@ -23,6 +23,11 @@ class Level(StrEnum):
         """0 for the best."""
         return list(Level).index(self)
 
+    @property
+    def of_reason(self) -> str:
+        """How a reason of this level begins where people read it: what passes is a note."""
+        return "note" if self is Level.PASS else self.upper()
+
 
 def worst(levels: Iterable[Level]) -> Level:
     """Return the worst of some levels; PASS if there are none."""
@@ -120,7 +125,7 @@ class Verdict(Record):
     def lines(self, least: Level = Level.WARN) -> list[str]:
         """Return the whole with its reasons, then sensors and their reasons of at least a level."""
         lines = [f"verdict: {self.level.upper()}"]
-        lines += [f"  {each.level.upper()}: {each.text}" for each in self.reasons]
+        lines += [f"  {each.level.of_reason}: {each.text}" for each in self.reasons]
         for sensor in self.sensors:
             if sensor.level.rank >= least.rank:
                 texts = [each.text for each in sensor.reasons if each.level.rank >= least.rank]
