@@ -11,11 +11,11 @@ from l2m_gtsam.batch.files import check_bags, check_outputs, ensure_folder, read
 from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, LidarMap, Recording, Trajectory
-from l2m_gtsam.errors import MapError
+from l2m_gtsam.errors import CalibrationError, MapError
 from l2m_gtsam.lidar.surface import smoothed
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.progress import Progress, counter
-from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
@@ -218,6 +218,7 @@ def calibrate_suite_file(
     found = calibrate_suite(
         recordings, assumed, config.mapping.suite, progress, config.mapping.pose_noise
     )
+    _check_solved(found, bags)
     if known is not None and level_of(known) is Level.FAIL:
         doubt = f"what was known of the sensors is {known}, whose verdict is FAIL"
         found = replace(found, doubts=(*found.doubts, doubt))
@@ -225,3 +226,14 @@ def calibrate_suite_file(
     ensure_folder(out.parent)
     write_calibration(out, result)
     return result
+
+
+def _check_solved(found: CalibrationResult, bags: Sequence[Path]) -> None:
+    """Refuse a calibration that no command would take."""
+    if any(each.status is SensorStatus.SOLVED for each in found.sensors):
+        return
+    first = found.sensors[0]
+    raise CalibrationError(
+        f"{', '.join(map(str, bags))}: no sensor of the suite is solved, nothing is written: "
+        f"{'; '.join([first.message, *found.doubts[:1]])}"
+    )
