@@ -79,7 +79,7 @@ def verdict_notes(path: Path, result: CalibrationResult, despite_verdict: bool) 
         return (f"{path}: {NOT_JUDGED}; it holds no verdict",)
     verdict = result.judgement.verdict
     if verdict.level is Level.PASS:
-        return tuple(f"{path}: {each}" for each in result.judgement.disagreeing)
+        return tuple(f"{path}: {each}" for each in result.judgement.before())
     warning = f"{path}: its verdict is {verdict.level.upper()}: {_worst_reason(verdict)}"
     if verdict.level is Level.FAIL and not despite_verdict:
         raise CalibrationError(f"{warning}; to use it all the same, give --despite-verdict")

@@ -55,7 +55,7 @@ def report(
 
         reported = report_folder(folder, config, progress, pdf=pdf)
     print_verdict(reported.judgement.verdict)
-    warn([f"the verdict was {each}" for each in reported.judgement.disagreeing])
+    warn(reported.judgement.before())
     written = [folder / REPORT_FILE, *([folder / PDF_FILE] if pdf else [])]
     say_written(written, reported.report_id)
 

@@ -122,6 +122,17 @@ class Verdict(Record):
         """Return the number of sensors with this verdict."""
         return sum(each.level == level for each in self.sensors)
 
+    @property
+    def warnings(self) -> "tuple[SaidReason, ...]":
+        """All reasons of at least WARN, those of all sensors first."""
+        whole = [("", each) for each in self.reasons]
+        own = [(of.sensor, each) for of in self.sensors for each in of.reasons]
+        return tuple(
+            SaidReason(sensor, each.level, each.text)
+            for sensor, each in (*whole, *own)
+            if each.level is not Level.PASS
+        )
+
     def lines(self, least: Level = Level.WARN) -> list[str]:
         """Return the whole with its reasons, then sensors and their reasons of at least a level."""
         lines = [f"verdict: {self.level.upper()}"]
@@ -135,6 +146,18 @@ class Verdict(Record):
 
 
 @dataclass(frozen=True)
+class SaidReason(Record):
+    """A reason and the sensor that it is of; no name where it is of all."""
+
+    sensor: str
+    level: Level
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.level.upper()}{f' {self.sensor}' if self.sensor else ''}: {self.text}"
+
+
+@dataclass(frozen=True)
 class EarlierVerdict(Record):
     """What the same numbers were judged before.
 
@@ -144,15 +167,19 @@ class EarlierVerdict(Record):
         The verdict then.
     changed
         Thresholds that were changed after it, "name: old -> new"; empty if none was.
+    reasons
+        Of at least WARN; empty in files of before.
     """
 
     level: Level
     changed: tuple[str, ...]
+    reasons: tuple[SaidReason, ...] = ()
 
     def __str__(self) -> str:
         if not self.changed:
-            return f"{self.level.upper()} before, by the same thresholds"
-        return f"{self.level.upper()} before, by other thresholds ({', '.join(self.changed)})"
+            return f"the verdict was {self.level.upper()} before, by the same thresholds"
+        changed = ", ".join(self.changed)
+        return f"the verdict was {self.level.upper()} before, by other thresholds ({changed})"
 
 
 @dataclass(frozen=True)
@@ -183,7 +210,7 @@ class Judgement(Record):
         changed = _changed(self.thresholds, thresholds)
         if not changed and verdict.level is self.verdict.level:
             return Judgement(verdict, thresholds, self.earlier)
-        before = EarlierVerdict(self.verdict.level, changed)
+        before = EarlierVerdict(self.verdict.level, changed, self.verdict.warnings)
         return Judgement(verdict, thresholds, (*self.earlier, before))
 
     @property
@@ -191,15 +218,32 @@ class Judgement(Record):
         """Of the verdict."""
         return self.verdict.level
 
-    @property
-    def disagreeing(self) -> tuple[EarlierVerdict, ...]:
-        """Earlier verdicts that were others."""
-        return tuple(each for each in self.earlier if each.level is not self.verdict.level)
+    def gone(self, earlier: EarlierVerdict) -> tuple[SaidReason, ...]:
+        """Return the reasons of an earlier verdict that are none now, or of a lower level."""
+        now: dict[tuple[str, str], int] = {}
+        for each in self.verdict.warnings:
+            now[each.sensor, each.text] = each.level.rank
+        return tuple(
+            each
+            for each in earlier.reasons
+            if now.get((each.sensor, each.text), -1) < each.level.rank
+        )
+
+    def before(self) -> list[str]:
+        """Return what was judged before, and which of its reasons are gone, a line each."""
+        return [
+            line
+            for each in self.earlier
+            for line in (
+                str(each),
+                *(f"no longer a reason: {reason}" for reason in self.gone(each)),
+            )
+        ]
 
     def lines(self) -> list[str]:
-        """Return verdict, reasons from WARN on, earlier verdicts and thresholds, a line each."""
+        """Return verdict, reasons from WARN on, what was judged before, and thresholds."""
         thresholds = json.dumps(self.thresholds, ensure_ascii=False)
-        earlier = [f"  {each}" for each in self.disagreeing]
+        earlier = [f"  {each}" for each in self.before()]
         return [*self.verdict.lines(), *earlier, f"judged by qa: {thresholds}"]
 
 
@@ -214,10 +258,16 @@ def judged_lines(judgement: Judgement | None) -> list[str]:
 def _changed(old: dict[str, Any], new: dict[str, Any]) -> tuple[str, ...]:
     before, after = _flat(old), _flat(new)
     return tuple(
-        f"{name}: {before.get(name, 'none')} -> {after.get(name, 'none')}"
+        f"{name}: {_value(before.get(name))} -> {_value(after.get(name))}"
         for name in {**before, **after}
         if before.get(name) != after.get(name)
     )
+
+
+def _value(value: Any) -> str:
+    if value is None:
+        return "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -320,7 +320,7 @@ def test_what_a_failed_calibration_was_used_for_says_so(
     for made in (field_map, more):
         assert "whose verdict is FAIL" in l2m("map", "info", made).err
     once = folder / "once.yaml"  # enough for what is looked at here
-    little = {"rounds": 1, "windows": 1, "readings": 300, "modes": 60}
+    little = {"searches": 0, "windows": 1, "readings": 300, "modes": 60}
     once.write_text(json.dumps({**json.loads(quick.read_text()), "mapping": {"suite": little}}))
     l2m("map", "suite", short, *suite, "--config", once, "--out", folder / "suite.yaml")
     assert "whose verdict is FAIL" in " ".join(read_calibration(folder / "suite.yaml").doubts)

@@ -148,7 +148,6 @@ def calibration_page(
             uncertainty=UNCERTAINTY[result.uncertainty],
             model=MODEL,
             options=json.dumps(result.options, indent=2, ensure_ascii=False),
-            earlier=() if result.judgement is None else result.judgement.earlier,
             identity=identity or Identity(calibration_content(result)["id"]),
         )
 

@@ -30,7 +30,7 @@ from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.record_files import read_metrics, write_metrics
 from tests.drives.verdict import EIGHT, changed_place, drive, with_series
-from tests.support.command_line import complaint_here
+from tests.support.command_line import complaint_here, l2m
 
 
 @dataclass(frozen=True)
@@ -236,3 +236,19 @@ def test_a_browser_that_fails_leaves_no_pdf(
     line = complaint_here("report", made.folder, "--pdf")
     assert "could not print report.html (exit code 3)" in line
     assert not (made.folder / "report.pdf").exists()
+
+
+def test_thresholds_that_remove_a_reason_leave_a_trace(made: Made, tmp_path: Path) -> None:
+    """On the page and in the terminal, also where the level stays; halves can be left out."""
+    shutil.copytree(made.folder, tmp_path / "made")
+    folder, lax = tmp_path / "made", tmp_path / "lax.yaml"
+    lax.write_text("qa: {rejected: {warn: 0.9, fail: 0.95}, halves: false}")
+    run = l2m("report", folder, "--config", lax)
+    page = (folder / REPORT_FILE).read_text()
+    assert "by other thresholds" in run.err
+    assert "rejected.warn: 0.02 -> 0.9" in run.err
+    assert "halves: True -&gt; False" in page
+    gone = [line for line in run.err.splitlines() if "no longer a reason" in line]
+    assert any("fit neither map nor distortion" in line for line in gone)
+    assert "No longer a reason" in page
+    assert "Not judged (qa.halves)" in page

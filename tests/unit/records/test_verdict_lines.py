@@ -30,3 +30,27 @@ def test_a_note_is_no_verdict(own: tuple[Reason, ...], capsys: pytest.CaptureFix
 def test_reasons_keep_their_level() -> None:
     verdict = Verdict.of([NOTE, GRAVE, Reason(Level.WARN, "It is short.")], [])
     assert [line.split()[0] for line in verdict.lines()] == ["verdict:", "FAIL:", "WARN:", "note:"]
+
+
+APART = Reason(Level.FAIL, "It does not repeat.")
+LOOSE = Reason(Level.WARN, "Its place is only known to ± 12 mm (1 sigma).")
+
+
+def test_reasons_that_other_thresholds_remove_are_named() -> None:
+    """With the thresholds; what is as grave as before, or graver, is not gone."""
+    first = Verdict.of([], [SensorVerdict.of("mag", [APART, LOOSE])])
+    laxer = Verdict.of([], [SensorVerdict.of("mag", [LOOSE])])
+    judged = Judgement(first, {"halves": True, "limit": 1 / 3})
+    again = judged.again(laxer, {"halves": False, "limit": 0.9})
+    changed = "halves: True -> False, limit: 0.333333 -> 0.9"
+    told = (
+        f"the verdict was FAIL before, by other thresholds ({changed})",
+        "no longer a reason: FAIL mag: It does not repeat.",
+    )
+    assert tuple(again.before()) == told
+    assert [line for line in judged_lines(again) if line.strip() in told]
+    # the same thresholds as at first: the reason is back
+    back = again.again(first, judged.thresholds)
+    assert not any("no longer" in line for line in back.before())
+    graver = Verdict.of([], [SensorVerdict.of("mag", [APART, Reason(Level.FAIL, LOOSE.text)])])
+    assert not any("no longer" in line for line in judged.again(graver, {}).before())
