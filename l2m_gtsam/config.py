@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_origin
+from typing import Annotated, Any, TypeVar, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.errors import ConfigError
@@ -22,6 +22,12 @@ from l2m_gtsam.text.shown import shown, shown_value
 Model = TypeVar("Model", bound=BaseModel)
 
 LONGEST_KEY, LONGEST_REASON = 120, 400  # letters
+MOST_ENTRIES = 40  # of a report
+
+
+EntryName = Annotated[str, Field(min_length=1, max_length=60)]
+EntryText = Annotated[str, Field(max_length=300)]
+ReportEntries = Annotated[dict[EntryName, EntryText], Field(max_length=MOST_ENTRIES)]
 
 
 class Config(Options):
@@ -43,6 +49,10 @@ class Config(Options):
     """Verdicts of `l2m report`."""
     fleet: FleetOptions = FleetOptions()
     """Outliers and pictures of `l2m batch`."""
+    report: ReportEntries = Field(default_factory=dict)
+    """What else the head of a report of `l2m calibrate` says, by name: vehicle, operator, place,
+    serial numbers, temperature. Text; numbers in quotes. At most 40 entries of 60 and 300 letters;
+    kept in `calibration.yaml` under `options`."""
 
 
 def load_config(path: Path | None) -> Config:

@@ -200,6 +200,8 @@ class Recording:
         a clock that was set.
     origins
         What else it was made from, a sentence each with the hash of the file.
+    poses
+        The file with its poses; absent where they are in the source.
     """
 
     trajectory: Trajectory
@@ -210,6 +212,7 @@ class Recording:
     moved_ns: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
     origins: tuple[str, ...] = ()
+    poses: SourceFile | None = None
 
     @property
     def parts(self) -> tuple["Recording", ...]:

@@ -100,6 +100,7 @@ WORDS = {
     "model_type": "names with values are expected",
     "model_attributes_type": "names with values are expected",
     "dataclass_type": "names with values are expected",
+    "string_type": "text is expected; put numbers and dates in quotes",
 }
 
 

@@ -13,6 +13,7 @@ from l2m_gtsam.batch.files import (
     read_drive,
 )
 from l2m_gtsam.batch.scan_poses import read_drives_on
+from l2m_gtsam.batch.software import versions
 from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor, Recording
@@ -102,7 +103,7 @@ def calibrate_bags(
     saved = SavedMap.read(map_path)
     recording = read_drives_on(saved, bags, config, progress)
     field_map, source = saved.open(progress, recording.parts), source_file(map_path)
-    opened = OpenMap(field_map, source, saved.doubts)
+    opened = OpenMap.of(saved, field_map, source)
     return calibrate_drive(recording, opened, config, out, progress, truth, view)
 
 
@@ -120,7 +121,13 @@ def calibrate_drive(
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
     metrics = evaluate(recording, found, config.calibration, config.qa, progress)
     doubts = (*found.result.doubts, *opened.doubts)
-    unjudged = replace(found.result, options=config.model_dump(mode="json"), doubts=doubts)
+    unjudged = replace(
+        found.result,
+        options=config.model_dump(mode="json"),
+        doubts=doubts,
+        map_origin=opened.origin,
+        versions=versions(),
+    )
     result = replace(unjudged, judgement=judgement_of(unjudged, metrics, config.qa))
     drives = [each.trajectory for each in recording.parts]
     figure = calibration_figure(metrics.map, drives, result, truth)

@@ -11,11 +11,12 @@ from l2m_gtsam.config import Config
 from l2m_gtsam.data import MapState, Recording, ScalarSeries, SourceFile
 from l2m_gtsam.errors import BagError, CalibrationError, MapError, OutputError
 from l2m_gtsam.maps.build import map_from_state
-from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.field_map import FieldMap, Remembering
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.options import Options, first_fault
 from l2m_gtsam.progress import Count, Progress, counter
 from l2m_gtsam.records.map_diary import UNDATED, MapDrive
+from l2m_gtsam.records.provenance import MapOrigin, NamedSource
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.files import source_file, unwritten
@@ -108,6 +109,15 @@ class OpenMap:
     field_map: FieldMap
     source: SourceFile
     doubts: tuple[str, ...] = ()
+    origin: MapOrigin | None = None
+
+    @classmethod
+    def of(cls, saved: "SavedMap", field_map: FieldMap, source: SourceFile) -> "OpenMap":
+        """Return a map with what its file says of where it came from."""
+        diary = field_map.diary if isinstance(field_map, Remembering) else None
+        later = () if diary is None else diary.drives[1:]
+        origin = replace(saved.origin, updated=later[-1].ended if later else None)
+        return cls(field_map, source, saved.doubts, origin)
 
 
 @dataclass(frozen=True)
@@ -144,11 +154,12 @@ class SavedMap:
     @property
     def surveyed(self) -> MapDrive:
         """When the map was surveyed; undated if its file does not say, or nonsense."""
-        dates = self.state.provenance.get("surveyed")
-        try:
-            return MapDrive(**dates) if isinstance(dates, dict) else UNDATED
-        except (TypeError, ValueError):
-            return UNDATED
+        return surveyed_in(self.state.provenance)
+
+    @property
+    def origin(self) -> MapOrigin:
+        """What the map was made from, as its file says; what is not like it is left out."""
+        return origin_of(self.state.provenance)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -199,6 +210,40 @@ def used_file(path: Path, judgement: Level | None) -> dict[str, Any]:
     """Return what a map's file says of a calibration that it was made with."""
     verdict = {"verdict": Level.FAIL.value} if judgement is Level.FAIL else {}
     return {**vars(source_file(path)), **verdict}
+
+
+def surveyed_in(provenance: dict[str, Any]) -> MapDrive:
+    """Return when a map was surveyed; undated if its file does not say, or nonsense."""
+    dates = provenance.get("surveyed")
+    try:
+        return MapDrive(**dates) if isinstance(dates, dict) else UNDATED
+    except (TypeError, ValueError):
+        return UNDATED
+
+
+def origin_of(provenance: dict[str, Any]) -> MapOrigin:
+    """Return what a map was made from.
+
+    Parameters
+    ----------
+    provenance
+        What the file of a map says of itself; it may have been tampered with.
+    """
+    updates = provenance.get("updates")
+    later = updates if isinstance(updates, list) else []
+    bags = provenance.get("bags")
+    files = [("survey", each) for each in (bags if isinstance(bags, list) else [])]
+    files += [(name, provenance.get(name)) for name in USED]
+    files += [("suite of an update", part.get("suite")) for part in later if isinstance(part, dict)]
+    files += [(name, provenance.get(name)) for name in ("structure", "lidar")]
+    sources = (
+        NamedSource(role, path, sha256)
+        for role, each in files
+        if isinstance(each, dict)
+        and isinstance(path := each.get("path"), str)
+        and isinstance(sha256 := each.get("sha256"), str)
+    )
+    return MapOrigin(surveyed_in(provenance), None, tuple(sources))
 
 
 def doubts_of_origin(provenance: dict[str, Any]) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder, used_file
+from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder, origin_of, used_file
 from l2m_gtsam.batch.survey import MappingDrives, read_survey, scanned_place
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
@@ -17,6 +17,7 @@ from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary, Remembering
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.map_diary import MapDiary
+from l2m_gtsam.records.provenance import MapOrigin
 from l2m_gtsam.storage.map_file import save_map
 from l2m_gtsam.upkeep.dated_changes import drive_dates
 from l2m_gtsam.upkeep.kept_map import kept_up
@@ -29,6 +30,11 @@ class MapDescription:
     summary: MapSummary
     provenance: dict[str, Any]
     diary: MapDiary | None = None
+
+    @property
+    def origin(self) -> MapOrigin:
+        """What it was made from, and when."""
+        return origin_of(self.provenance)
 
     @classmethod
     def of(cls, field_map: FieldMap, provenance: dict[str, Any]) -> "MapDescription":

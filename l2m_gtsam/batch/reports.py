@@ -24,6 +24,7 @@ from l2m_gtsam.options import first_fault
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.calibration_page import STAGE, calibration_page
+from l2m_gtsam.qa.report.facts import ENTRIES
 from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.qa.verdict.calibration import judge, judgement_of
 from l2m_gtsam.qa.verdict.mounting import check_names
@@ -277,7 +278,7 @@ def holds_localisation(folder: Path) -> bool:
 
 def _report_calibration(folder: Path, config: Path | None, progress: Progress) -> Reported:
     source = folder / CALIBRATION_FILE
-    found = read_calibration(source)
+    found = read = read_calibration(source)
     metrics = read_metrics(folder / METRICS_FILE)
     digest = source_file(folder / METRICS_FILE).sha256
     if found.metrics_sha256 not in ("", digest):
@@ -285,12 +286,15 @@ def _report_calibration(folder: Path, config: Path | None, progress: Progress) -
             f"{folder / METRICS_FILE}: is not the file that {CALIBRATION_FILE} was written with "
             f"(report {found.report_id[:SHOWN]}), or was changed; restore it, or calibrate again"
         )
-    options = _saved(found) if config is None else load_config(config).qa
+    given = None if config is None else load_config(config)
+    options = _saved(found) if given is None else given.qa
+    if given is not None and given.report:
+        found = replace(found, options={**found.options, ENTRIES: given.report})
     check_names([each.sensor for each in found.sensors], options)
     judgement = judgement_of(found, metrics, options)
     result = replace(found, judgement=judgement, metrics_sha256=digest)
     with published(folder, adds=True) as stage:
-        if judgement != found.judgement:
+        if judgement != found.judgement or found.options != read.options:
             source = stage / CALIBRATION_FILE
             result = write_calibration(source, result)
         identity = Identity(result.report_id, source_file(source))

@@ -10,6 +10,7 @@ from l2m_gtsam.batch.files import SavedMap, check_outputs
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.reports import REPORT_FILE, SLAM_FILE, write_slam_report
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow, scan_start
+from l2m_gtsam.batch.software import versions
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording, RigidTransform
 from l2m_gtsam.errors import LidarError, MapError, OutputError
@@ -246,7 +247,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     context = RecordContext(calibration, found.field_map, options, gap, truth, truth_source)
     unjudged = localisation_record(found.result, found.solution, context)
     judgement = judgement_of_localisation(unjudged, config.qa)
-    record = replace(unjudged, judgement=judgement)
+    record = replace(unjudged, judgement=judgement, versions=versions())
     # A map that was read may be there from an exploration.
     names = [name for name in FILES if name != MAP_FILE or saved is None]
     with published(out, *names) as stage:

@@ -9,6 +9,7 @@ import numpy as np
 
 from l2m_gtsam.batch.files import check_bags, check_outputs, ensure_folder, read_drive
 from l2m_gtsam.batch.scan_poses import read_drive_or_follow
+from l2m_gtsam.batch.software import versions
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, LidarMap, Recording, Trajectory
 from l2m_gtsam.errors import CalibrationError, MapError
@@ -222,7 +223,8 @@ def calibrate_suite_file(
     if known is not None and level_of(known) is Level.FAIL:
         doubt = f"what was known of the sensors is {known}, whose verdict is FAIL"
         found = replace(found, doubts=(*found.doubts, doubt))
-    result = replace(found, options=config.model_dump(mode="json", include={"bag", "mapping"}))
+    options = config.model_dump(mode="json", include={"bag", "mapping"})
+    result = replace(found, options=options, versions=versions())
     ensure_folder(out.parent)
     write_calibration(out, result)
     return result

@@ -1,14 +1,13 @@
 """Calibrations tested on other drives, and beside older ones."""
 
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
 from l2m_gtsam.batch.files import SavedMap, check_outputs, saved_options
 from l2m_gtsam.batch.scan_poses import read_drive_on
-from l2m_gtsam.calibration.calibrate import VERSIONED
+from l2m_gtsam.batch.software import versions
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.config import Config, load_config, with_poses
 from l2m_gtsam.data import SourceFile
@@ -20,10 +19,10 @@ from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.qa.report.validation_page import validation_page
 from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.validation import (
     CalibrationComparison,
     DriveValidation,
-    NamedSource,
     Validation,
 )
 from l2m_gtsam.storage.bag_options import BagOptions, PoseFileOptions
@@ -101,7 +100,7 @@ def validate_calibration(asked: ValidationRequest, progress: Progress) -> Valida
         comparison=comparison,
         thresholds=validation_thresholds(config.qa),
         sources=tuple(sources),
-        versions={name: version(name) for name in VERSIONED},
+        versions=versions(),
     )
     if asked.out is not None:
         _write(asked.out, found)

@@ -35,6 +35,7 @@ from l2m_gtsam.records.calibration import (
     SensorCalibration,
     SensorStatus,
 )
+from l2m_gtsam.records.provenance import RecordedDrive, dated
 from l2m_gtsam.solve.explain import movement
 from l2m_gtsam.solve.robust import disagreements
 
@@ -165,6 +166,7 @@ def calibrated(
         pose_duration=solution.pose_duration,
         unseen_warp_m=solution.unseen_warp_m,
         sources=changed.records,
+        recorded=tuple(map(_recorded, recording.parts)),
     )
     return Calibrated(result, solution, field_map, solver_map)
 
@@ -185,6 +187,13 @@ def taken_for_exact(readings: Readings, field_map: QueryableMap, budget: Budget)
     sensors = () if survey and survey.sensors_uncertain else ("the survey's sensors",)
     poses = () if survey and survey.poses_uncertain else ("the survey's poses",)
     return (*drive, *sensors, *poses)
+
+
+def _recorded(drive: Recording) -> RecordedDrive:
+    """Return when a drive was recorded, and in which frames."""
+    poses = drive.trajectory
+    when = dated(int(poses.stamp_ns[0]), int(poses.stamp_ns[-1]))
+    return RecordedDrive(when, poses.frame, poses.child_frame, drive.poses)
 
 
 def _starts(

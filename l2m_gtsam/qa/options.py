@@ -185,6 +185,9 @@ class QaOptions(Options):
     few_headings: float = Field(default=0.3, ge=0, le=1)
     """A drive that leaves something open, or known too little, and took a smaller share of all
     headings is called straight."""
+    map_days: PositiveFloat | None = None
+    """Age of the map at the drive, in days since its survey or the last drive that it was given,
+    above which the verdict is WARN at least; never if not given. The age is in the report."""
     halves: bool = True
     """Whether both halves of a drive, or several drives, are calibrated by themselves, and
     judged."""

@@ -23,6 +23,7 @@ from l2m_gtsam.records.error_budget import (
     VarianceShare,
 )
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource, clear_cause
+from l2m_gtsam.records.provenance import MapOrigin, RecordedDrive
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.verdict import Judgement
@@ -391,6 +392,10 @@ class CalibrationResult:
     unseen_warp_m
         Shifts of the drive's frame against the map's that readings leave possible, root mean square
         along each axis of the floor in metres; sigmas hold them. Absent where a bend was found.
+    recorded
+        When each drive was recorded, and which frames its poses are of, in the order of `drives`.
+    map_origin
+        What the map was made from, and when; absent for a map that is not of a file.
     metrics_sha256
         Of the file with the figures that it was judged by; empty where there is none.
     report_id
@@ -417,6 +422,8 @@ class CalibrationResult:
     stated: tuple[StatedSize, ...] = ()
     pose_duration: PoseDuration | None = None
     unseen_warp_m: float | None = None
+    recorded: tuple[RecordedDrive, ...] = ()
+    map_origin: MapOrigin | None = None
     metrics_sha256: str = ""
     report_id: str = field(default="", compare=False)
 
@@ -424,6 +431,13 @@ class CalibrationResult:
     def drives(self) -> tuple[SourceFile, ...]:
         """All drives with hashes; none if the data did not come from files."""
         return self.bags or (() if self.bag is None else (self.bag,))
+
+    @property
+    def map_age_days(self) -> float | None:
+        """How old the map was when the first drive began; None where dates are not known."""
+        if self.map_origin is None or not self.recorded:
+            return None
+        return self.map_origin.age_days(self.recorded[0].when)
 
     def __getitem__(self, sensor: str) -> SensorCalibration:
         for entry in self.sensors:

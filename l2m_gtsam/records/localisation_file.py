@@ -19,8 +19,9 @@ from l2m_gtsam.records.localisation import (
     StartFinding,
 )
 from l2m_gtsam.records.metrics import FitFigures, MapPicture, Normalised, Row, Rows, Series
+from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.record import Record
-from l2m_gtsam.records.validation import ChiSquare, NamedSource
+from l2m_gtsam.records.validation import ChiSquare
 from l2m_gtsam.records.verdict import Judgement
 
 POSE_FREEDOM = 6

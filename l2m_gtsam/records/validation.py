@@ -13,6 +13,7 @@ from pydantic import AliasChoices, Field
 from l2m_gtsam.data import SaturatedAxis
 from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Row, Series
 from l2m_gtsam.records.places import ChangedSource, WhatChanged
+from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.verdict import Threshold, Verdict
 
@@ -306,15 +307,6 @@ class CalibrationComparison(Record):
     assumption: str
     same_bag: bool
     failed: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class NamedSource(Record):
-    """A file that took part: what it was, its path and the SHA-256 of its content."""
-
-    role: str
-    path: str
-    sha256: str
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,9 @@ from l2m_gtsam.records.localisation_file import (
     StartRecord,
     Timeline,
 )
+from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.record import fields_of
-from l2m_gtsam.records.validation import ChiSquare, NamedSource
+from l2m_gtsam.records.validation import ChiSquare
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.pose_graph import stated_information_root
 from l2m_gtsam.slam.solution import DriveSolution

@@ -81,10 +81,12 @@ def read_recording(path: Path, options: BagOptions, progress: Count | None = Non
     trajectory = _trajectory(path, buffers, options, paths)
     check_clocks(path, trajectory, series)
     notes, origins = _clocks(path, buffers, options), tuple[str, ...]()
-    if apart is not None:
-        digest = source_file(apart).sha256
-        origins = (f"{path}: poses are those of {apart} (sha256 {digest})",)
-    return Recording(trajectory, series, source_file(path), notes=notes, origins=origins)
+    source = None if apart is None else source_file(apart)
+    if source is not None:
+        origins = (f"{path}: poses are those of {source.path} (sha256 {source.sha256})",)
+    return Recording(
+        trajectory, series, source_file(path), notes=notes, origins=origins, poses=source
+    )
 
 
 def read_fields(path: Path, options: BagOptions) -> tuple[FieldSeries, ...]:

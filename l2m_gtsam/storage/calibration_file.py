@@ -122,12 +122,20 @@ MODEL = {
         "shifts of the drive's frame against the map's that readings leave possible, metres, root "
         "mean square along each axis of the floor; covariances hold them"
     ),
+    "recorded": (
+        "first and last pose of each drive in UTC (null: its clock was not set), frames of its "
+        "poses, and the file that they are from if that is not the bag"
+    ),
+    "map_origin": (
+        "what the map was made from, as its file has it: first and last pose of the survey, end "
+        "of the last drive that it was given since, files with their digests"
+    ),
     "traces": "some poses of each drive, by which validate recognises it whatever file it is in",
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
 OPTIONAL = (
     *("notes", "exact", "disturbances", "stated", "pose_duration", "unseen_warp_m"),
-    *("traces", "sources", "metrics_sha256"),
+    *("traces", "sources", "metrics_sha256", "recorded", "map_origin"),
 )
 SENSOR_KEYS = (
     *("status", "message", "t_lidar_mag", "t_sigma", "C", "C_sigma", "H", "H_sigma"),
@@ -188,6 +196,8 @@ def calibration_content(result: CalibrationResult) -> dict[str, Any]:
         "disagreements": disagreements,
         "sources": plain["sources"],
         **source_entries(result),
+        "recorded": plain["recorded"],
+        "map_origin": plain["map_origin"],
         "traces": plain["traces"],
         "versions": plain["versions"],
         "iterations": plain["iterations"],

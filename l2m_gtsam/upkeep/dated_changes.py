@@ -1,7 +1,6 @@
 """Sources that a drive shows as what happened: steel came, went or was moved, and when."""
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
 
 import numpy as np
 
@@ -9,25 +8,16 @@ from l2m_gtsam.data import FloatArray, Recording
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.sources.source import UT_M3, SourceShape
-from l2m_gtsam.records.map_diary import UNDATED, DatedChange, Happening, MapDiary, MapDrive
+from l2m_gtsam.records.map_diary import DatedChange, Happening, MapDiary, MapDrive
 from l2m_gtsam.records.places import ChangedSource
-
-# The years 2000 to 2100: clocks that were never set begin in 1970.
-CREDIBLE_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9
+from l2m_gtsam.records.provenance import dated
 
 
 def drive_dates(*recordings: Recording) -> MapDrive:
     """Return first and last pose of drives; undated if a stamp is no date of this century."""
     begun = min(int(each.trajectory.stamp_ns.min()) for each in recordings)
     ended = max(int(each.trajectory.stamp_ns.max()) for each in recordings)
-    if begun < CREDIBLE_NS[0] or ended > CREDIBLE_NS[1]:
-        return UNDATED
-    return MapDrive(in_utc(begun), in_utc(ended))
-
-
-def in_utc(stamp_ns: int) -> str:
-    """Return a stamp in nanoseconds as ISO date and time, to the second."""
-    return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return dated(begun, ended)
 
 
 # A source is detected where its field is as strong as this, and as this share of its strongest.

@@ -8,7 +8,7 @@ import pytest
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.localisation_page import localisation_page
 from l2m_gtsam.records.localisation_file import LocalisationRecord
-from l2m_gtsam.records.validation import NamedSource
+from l2m_gtsam.records.provenance import NamedSource
 from tests.drives.hostile import localisation
 from tests.drives.localised import record
 from tests.support.browsing import (

@@ -11,7 +11,8 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.validation_page import validation_page
 from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.records.validation import NamedSource, Validation
+from l2m_gtsam.records.provenance import NamedSource
+from l2m_gtsam.records.validation import Validation
 from l2m_gtsam.validation.validate import validate
 from tests.drives.degenerate import STRONG
 from tests.drives.validation import OPTIONS, calibrated, changed, other_drive

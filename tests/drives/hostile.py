@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from l2m_gtsam.records.fleet import FleetRow
 from l2m_gtsam.records.localisation_file import LocalisationRecord
-from l2m_gtsam.records.validation import NamedSource
+from l2m_gtsam.records.provenance import NamedSource
 from tests.drives.fleet_rows import row, sensor_row
 from tests.drives.localised import record
 

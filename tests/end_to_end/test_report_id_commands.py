@@ -4,12 +4,14 @@ import hashlib
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.map_file import load_map, save_map
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
 from tests.drives.yard import CalibratedYard, calibrated_yard
 from tests.support.command_line import complaint_here, l2m
@@ -83,3 +85,41 @@ def test_page_file_and_terminal_have_one_id(place: CalibratedYard, tmp_path: Pat
             assert f"sha256 {digest}" in page
         seen.append(report_id)
     assert seen[0] != seen[1]
+
+
+def test_entries_can_be_added_later(place: CalibratedYard, tmp_path: Path) -> None:
+    """They are part of the file, and of the id."""
+    for name in ("calibration.yaml", "metrics.json"):
+        shutil.copy(place.calibration.parent / name, tmp_path)
+    config = tmp_path / "entries.yaml"
+    config.write_text('report: {operator: A. Mann, "serial number": "0123"}\n')
+    l2m("report", tmp_path, "--config", config)
+    found = read_calibration(tmp_path / "calibration.yaml")
+    assert found.options["report"] == {"operator": "A. Mann", "serial number": "0123"}
+    assert found.report_id != read_calibration(place.calibration).report_id
+    assert "<dt>operator</dt><dd>A. Mann</dd>" in (tmp_path / "report.html").read_text()
+    l2m("report", tmp_path)
+    assert read_calibration(tmp_path / "calibration.yaml").report_id == found.report_id
+
+
+def test_a_file_says_when_and_from_what(place: CalibratedYard) -> None:
+    """Of the drive, of its frames and of the map's survey."""
+    found = read_calibration(place.calibration)
+    (drive,) = found.recorded
+    assert drive.when.begun is not None
+    assert (drive.frame, drive.poses) == ("map", None)
+    assert found.map_origin is not None
+    assert found.map_origin.surveyed.begun is not None
+    (survey,) = found.map_origin.sources
+    assert (survey.role, len(survey.sha256)) == ("survey", 64)
+    assert "python" in found.versions
+
+
+def test_map_info_names_suite_and_survey(place: CalibratedYard, tmp_path: Path) -> None:
+    state = load_map(place.map)
+    suite = {"path": "suite.yaml", "sha256": "ab" * 32}
+    path = tmp_path / "map.npz"
+    save_map(path, replace(state, provenance={**state.provenance, "suite": suite}))
+    out = l2m("map", "info", path).out
+    assert f"suite.yaml, {'ab' * 32}" in out
+    assert str(state.provenance["surveyed"]["begun"])[:10] in out

@@ -13,8 +13,9 @@ def assert_equal(a: object, b: object) -> None:
         for x, y in zip(a, b, strict=True):
             assert_equal(x, y)
     elif hasattr(a, "__dataclass_fields__"):
-        for name in a.__dataclass_fields__:
-            assert_equal(getattr(a, name), getattr(b, name))
+        for name, field in a.__dataclass_fields__.items():
+            if field.compare:
+                assert_equal(getattr(a, name), getattr(b, name))
     elif isinstance(a, float) and isinstance(b, float) and np.isnan(a):
         assert np.isnan(b)
     else:

@@ -9,6 +9,7 @@ from rich.table import Table
 from l2m_gtsam.batch.maps import MapDescription
 from l2m_gtsam.cli.tables import add_numbers, add_text, plain_table, vector_cell
 from l2m_gtsam.maps.compare import KindFigures, KindResult, MapComparison
+from l2m_gtsam.qa.report.facts import period
 from l2m_gtsam.records.map_diary import MapDiary, between, doubtful, words_of
 from l2m_gtsam.text.rounded import by_sigma, sigma_alone
 
@@ -93,6 +94,11 @@ def map_table(description: MapDescription) -> Table:
         table.add_row(name, escape(str(description.provenance.get(name, "unknown"))))
     for source in _bags(description.provenance):
         table.add_row("made from", escape(", ".join(str(value) for value in source.values())))
+    origin = description.origin
+    table.add_row("surveyed", escape(period(origin.surveyed)))
+    for each in origin.sources:
+        if each.role.startswith(("suite", "calibration")):
+            table.add_row(escape(each.role), escape(f"{each.path}, {each.sha256}"))
     for name, shown in (("structure", "structure"), ("lidar", "cloud of scans")):
         if isinstance(parts := description.provenance.get(name), dict):
             facts = (f"{part.replace('_', ' ')} {value}" for part, value in parts.items())

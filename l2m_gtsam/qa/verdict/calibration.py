@@ -66,7 +66,8 @@ def judgement_of(result: CalibrationResult, metrics: Measures, options: QaOption
     result, metrics, options
         As of `judge`.
     """
-    used = options.model_dump(mode="json", exclude={"validation", "slam"})
+    absent = {"map_days"} if options.map_days is None else set()
+    used = options.model_dump(mode="json", exclude={"validation", "slam", *absent})
     return Judgement.of(judge(result, metrics, options), used, result.judgement)
 
 
@@ -80,6 +81,7 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
     """Return what speaks against map, place and drive."""
     reasons = [Reason(Level.WARN, f"Of the map: {doubt}.") for doubt in result.doubts]
     reasons += source_reasons(result.sources)
+    reasons += _old_map(result, cases[0].options) if cases else []
     shared = [each for each in result.disagreements if _is_shared(each, result)]
     reasons += [Reason(Level.WARN, _changed(each, result)) for each in shared[:MANY]]
     if len(shared) > MANY:
@@ -89,6 +91,18 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
     reasons += disturbance_reasons(result)
     reasons += stated_wrongly(result.stated)
     return _wrong_map(cases) or [*_on_drive(cases), *reasons, *_exact(result)]
+
+
+def _old_map(result: CalibrationResult, options: QaOptions) -> list[Reason]:
+    """Return that the map is older than it may be."""
+    limit, age = options.map_days, result.map_age_days
+    if limit is None or age is None or age <= limit:
+        return []
+    text = (
+        f"The map was {age:.3g} days old at the drive, more than the {limit:g} of `qa.map_days`: "
+        "steel may have changed since; survey the place again."
+    )
+    return [Reason(Level.WARN, text)]
 
 
 def _exact(result: CalibrationResult) -> list[Reason]:

@@ -332,6 +332,8 @@ def test_poses_of_a_file_beside_a_log(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.trajectory.p, p, rtol=1e-12)
     np.testing.assert_allclose(read_trajectory(log, options).p, p, rtol=1e-12)
     assert "traj.tum (sha256 " in found.origins[0]
+    assert found.poses is not None
+    assert found.poses.sha256 in found.origins[0]
     assert inspect_bag(log, options).obstacles == ()
     late = PoseFileOptions(path=tmp_path / "traj.tum", offset_s=1e6)
     with pytest.raises(BagError, match="different clocks"):

@@ -20,8 +20,9 @@ from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresho
 from l2m_gtsam.recording.drive_trace import trace_of
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus, TimeOffset
 from l2m_gtsam.records.places import ChangedSource, WhatChanged
+from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.sensor_models import MovingField
-from l2m_gtsam.records.validation import CalibrationPart, DriveValidation, NamedSource, Validation
+from l2m_gtsam.records.validation import CalibrationPart, DriveValidation, Validation
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.record_files import read_validation, write_validation
 from l2m_gtsam.studies.validation.drives import (
