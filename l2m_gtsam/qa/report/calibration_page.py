@@ -1,6 +1,5 @@
 """The report on a calibration: one page that needs nothing else."""
 
-import json
 from dataclasses import dataclass
 
 import matplotlib as mpl
@@ -12,6 +11,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.progress import Progress, counter, silent
 from l2m_gtsam.qa.options import QaOptions, thresholds
 from l2m_gtsam.qa.report.drawing import Drawing
+from l2m_gtsam.qa.report.facts import facts_of, files_of, lidar_frame
 from l2m_gtsam.qa.report.figures import map as map_figures
 from l2m_gtsam.qa.report.figures import readings, statistics
 from l2m_gtsam.qa.report.figures.changes import changes_figure
@@ -34,6 +34,7 @@ from l2m_gtsam.records.metrics import Metrics, SensorMetrics
 from l2m_gtsam.records.verdict import SensorVerdict
 from l2m_gtsam.solve.rank import PARAMETERS
 from l2m_gtsam.storage.calibration_file import MODEL, UNCERTAINTY, calibration_content
+from l2m_gtsam.storage.yaml_file import yaml_text
 
 STAGE = "report"
 
@@ -129,6 +130,9 @@ def calibration_page(
         return render(
             "report.html.j2",
             result=result,
+            facts=facts_of(result),
+            lidar=lidar_frame(result),
+            files=files_of(result),
             metrics=metrics,
             verdict=verdict,
             found=[each for each in result.sensors if np.isfinite(each.t_lidar_mag).all()],
@@ -147,7 +151,7 @@ def calibration_page(
             repeatability="" if options.halves else " Not judged (qa.halves).",
             uncertainty=UNCERTAINTY[result.uncertainty],
             model=MODEL,
-            options=json.dumps(result.options, indent=2, ensure_ascii=False),
+            options=yaml_text(result.options, ""),
             identity=identity or Identity(calibration_content(result)["id"]),
         )
 

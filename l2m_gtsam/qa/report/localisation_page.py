@@ -1,6 +1,5 @@
 """The page of a localisation: one file that needs nothing else, drawn from its record."""
 
-import json
 from dataclasses import dataclass
 
 import matplotlib as mpl
@@ -19,6 +18,7 @@ from l2m_gtsam.qa.verdict.localisation import judge_localisation, localisation_t
 from l2m_gtsam.records.localisation_file import LocalisationRecord, RefinedSensor, SensorRecord
 from l2m_gtsam.records.verdict import SensorVerdict
 from l2m_gtsam.solve.rank import PARAMETERS
+from l2m_gtsam.storage.yaml_file import yaml_text
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def localisation_page(
             sections=sections,
             thresholds=localisation_thresholds(options),
             parameters=PARAMETERS,
-            options=json.dumps(record.options, indent=2, ensure_ascii=False),
+            options=yaml_text(record.options, ""),
         )
 
 
