@@ -6,14 +6,21 @@ from itertools import combinations
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.text import Annotation
+from matplotlib.text import Annotation, Text
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.qa.report.figures.names import MOST_NAMES
-from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, Viewpoint, vehicle_figure
+from l2m_gtsam.qa.report.figures.vehicle import (
+    SIDE,
+    TOP,
+    Viewpoint,
+    calibration_figure,
+    vehicle_figure,
+)
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.verdict import Level, SensorVerdict, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.record_files import read_metrics
 from tests.support.repository import REPOSITORY
 
 
@@ -38,7 +45,8 @@ def labels(result: CalibrationResult, view: Viewpoint) -> tuple[list[str], Float
         for each in figure.findobj(Annotation)
         if isinstance(each, Annotation) and each.get_text().startswith(("mag_", "lidar"))
     ]
-    boxes = [each.get_window_extent().extents for each in found]
+    # without their lines
+    boxes = [Text.get_window_extent(each).extents for each in found]
     return [each.get_text() for each in found], np.array(boxes)
 
 
@@ -53,6 +61,38 @@ VEHICLES = {
     ),
     "in a row": np.column_stack([np.linspace(-1, 1, 12), np.zeros(12), np.full(12, 0.1)]),
 }
+
+
+DRIVE = Trajectory(np.arange(3), np.tile(np.eye(3), (3, 1, 1)), np.eye(3), "map", "lidar")
+PAIRS = np.array(
+    [(x, s * 0.4, z + s * 0.01) for x in (-0.4, 0.4) for z in (-0.3, -0.1) for s in (-1, 1)]
+)
+
+
+@pytest.mark.parametrize("overview", [False, True])
+def test_sensors_that_are_close_together_have_a_name_and_a_line_each(overview: bool) -> None:
+    """From the side pairs are 2 cm apart; names stay inside of the frame."""
+    result = calibration(PAIRS)
+    if overview:
+        picture = read_metrics(REPOSITORY / "tests" / "files" / "metrics.json").map
+        figure = calibration_figure(picture, [DRIVE], result, ())
+    else:
+        sensors = tuple(SensorVerdict(each.sensor, Level.PASS, ()) for each in result.sensors)
+        figure = vehicle_figure(result, Verdict(Level.PASS, (), sensors), SIDE)
+    FigureCanvasAgg(figure)
+    figure.draw_without_rendering()
+    axes = figure.axes[2] if overview else figure.axes[0]
+    names = [each for each in axes.texts if isinstance(each, Annotation)]
+    assert {each.get_text() for each in names} == {
+        "lidar",
+        *(each.sensor for each in result.sensors),
+    }
+    frame = axes.get_window_extent().extents
+    for each in names:
+        assert each.arrow_patch is not None
+        box = Text.get_window_extent(each).extents
+        assert np.all(box[:2] >= frame[:2])
+        assert np.all(box[2:] <= frame[2:])
 
 
 @pytest.mark.parametrize("view", [TOP, SIDE])

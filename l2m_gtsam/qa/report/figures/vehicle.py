@@ -10,13 +10,14 @@ from matplotlib.patches import Ellipse
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.qa.report.figures.map import draw_map
-from l2m_gtsam.qa.report.figures.names import GAP, Label, TextBox, placed
+from l2m_gtsam.qa.report.figures.names import OFFSETS, Label, placed
 from l2m_gtsam.qa.report.hover import axes_places
 from l2m_gtsam.qa.report.svg import (
     BAD,
     FAIR,
     GOOD,
     INK,
+    MUTED,
     SMALL,
     ellipse,
     new_figure,
@@ -33,6 +34,7 @@ SHAPES = {Level.PASS: "o", Level.WARN: "^", Level.FAIL: "X"}
 # An ellipse that is less than this share of the picture is a dot: all are drawn larger then.
 SEEN = 0.1
 MARGIN = 0.2  # around all places, of what they span
+INSIDE = 3.0  # points between a name and the frame
 ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200)
 
 
@@ -55,7 +57,6 @@ def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: Viewpoint)
     factor = enlargement(found, view)
     for sensor in found:
         _draw(axes, sensor, verdict[sensor.sensor].level, view, factor)
-    _name(axes, found, view)
     axes.plot(0, 0, "s", color=INK, markersize=9, markerfacecolor="none")
     names = ["xyz"[k] for k in view.axes]
     axes.set(xlabel=f"{names[0]} (m), forward", ylabel=f"{names[1]} (m)")
@@ -63,6 +64,8 @@ def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: Viewpoint)
     axes.locator_params(nbins=6)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.18)
+    _lay_out(figure)
+    _name(axes, found, view)
     for sensor in found:
         at = sensor.t_lidar_mag[list(view.axes)]
         axes_places(axes, at[None], [place_words(sensor, verdict)])
@@ -97,29 +100,33 @@ def _places(found: list[SensorCalibration], view: Viewpoint) -> FloatArray:
     return np.vstack([room, *own])
 
 
+def _lay_out(figure: Figure) -> None:
+    """Place all axes for good: names are written where there is room."""
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+    figure.set_layout_engine("none")
+
+
 def _name(axes: Axes, found: list[SensorCalibration], view: Viewpoint) -> None:
-    """Write names of sensors and of the lidar."""
-    places = _places(found, view)
-    room = np.array([axes.bbox.width, axes.bbox.height]) * 72.0 / axes.figure.dpi
-    span = np.ptp(places, axis=0)
-    scale = float((room / ((1 + 2 * MARGIN) * span)).min())
-    middle = 0.5 * scale * (places.min(axis=0) + places.max(axis=0))
-    frame = TextBox(middle - 0.5 * room, middle + 0.5 * room)
-    dots = scale * np.vstack([np.zeros(2), *(s.t_lidar_mag[list(view.axes)] for s in found)])
-    labels = [Label(dots[0], ("lidar",))]
-    labels += [Label(at, (s.sensor,)) for at, s in zip(dots[1:], found, strict=True)]
+    """Write names of sensors and of the lidar into axes that are where they will be."""
+    axes.apply_aspect()
+    points = 72.0 / axes.figure.dpi  # in a pixel
+    frame = points * axes.bbox.get_points() + [[INSIDE], [-INSIDE]]
+    places = np.vstack([np.zeros(2), *(s.t_lidar_mag[list(view.axes)] for s in found)])
+    dots = points * axes.transData.transform(places)
+    names = ["lidar", *(each.sensor for each in found)]
+    labels = [Label(at, (name,), OFFSETS[0]) for at, name in zip(dots, names, strict=True)]
     for label in placed(labels, dots, frame):
-        right, up = label.side * GAP
-        text = axes.annotate(
+        axes.annotate(
             "\n".join(label.lines),
-            tuple(label.at / scale),
-            xytext=(right, up),
+            tuple(axes.transData.inverted().transform(label.at / points)),
+            xytext=tuple(label.offset),
             textcoords="offset points",
             ha=("right", "center", "left")[label.side[0] + 1],
             va=("top", "center", "bottom")[label.side[1] + 1],
             fontsize=SMALL,
+            arrowprops={"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 0},
         )
-        text.set_in_layout(False)  # a long name is no reason to draw the vehicle smaller
 
 
 def _drawn(factor: int) -> str:
@@ -200,6 +207,9 @@ def calibration_figure(
     above.set_title("sensors on the vehicle, from above")
     side.set_title("from the side")
     above.legend(loc="lower left", bbox_to_anchor=(0, 1.08), ncols=2, fontsize="small")
+    _lay_out(figure)
+    for axes, view in ((above, TOP), (side, SIDE)):
+        _name(axes, solved, view)
     return figure
 
 
@@ -219,7 +229,6 @@ def _draw_vehicle(
         if (region := _ellipse(sensor, rows, factor)) is not None:
             region.set(facecolor="none", edgecolor=ESTIMATE, linewidth=1.4, zorder=3)
             axes.add_patch(region)
-    _name(axes, sensors, view)
     axes.plot(0, 0, "s", color="0.4", markersize=8)
     axes.plot([], [], ".", color=ESTIMATE, label=f"estimate, 95 % ellipse{_drawn(factor)}")
     if truth:
