@@ -211,10 +211,11 @@ def _sound(outcome: DriveOutcome) -> bool:
 
 
 def _sound_row(sensor: SensorRow) -> bool:
-    """Return whether a row has a known verdict, and a rotation or none."""
+    """Return whether a row has known verdicts, and a rotation or none."""
     q = sensor.quaternion_xyzw
     none = all(map(math.isnan, q))
-    return sensor.verdict in VERDICTS and (none or abs(math.hypot(*q) - 1) < UNIT)
+    judged = sensor.verdict in VERDICTS and sensor.own_verdict in ("", *VERDICTS)
+    return judged and (none or abs(math.hypot(*q) - 1) < UNIT)
 
 
 def _is_date(text: str) -> bool:

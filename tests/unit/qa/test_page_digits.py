@@ -34,7 +34,7 @@ def decimals(number: str) -> int:
 
 
 def test_values_and_sigmas_end_at_the_same_decimal() -> None:
-    text = page()
+    text = page().replace("\xa0", " ")
     pairs = re.findall(rf"({NUMBER}) ± ({NUMBER})", text)
     cells = re.findall(rf"\((?:m|1|µT)\)</th><td>({NUMBER})</td><td>({NUMBER})</td>", text)
     assert len(pairs) >= 6
