@@ -12,6 +12,7 @@ from pydantic import Field
 
 from l2m_gtsam.records.metrics import Row
 from l2m_gtsam.records.record import Record
+from l2m_gtsam.text.rounded import significant
 
 VERDICTS = ("pass", "warn", "fail")
 """On a sensor."""
@@ -151,7 +152,9 @@ class Outlier:
 
     def __str__(self) -> str:
         name, _, unit = self.parameter.partition(" (")
-        return f"{name} {self.deviation:+.3g} {unit.rstrip(')')}, {self.score:.1f} times expected"
+        sign = "" if self.deviation < 0 else "+"
+        by = f"{sign}{significant(self.deviation)} {unit.rstrip(')')}"
+        return f"{name} {by}, {self.score:.1f} times expected"
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ def test_a_turned_sensor_is_marked_about_its_axis() -> None:
     marked = with_outliers(rows, OPTIONS)
     assert [each.parameter for each in marked[2].outliers] == ["rotation_z (deg)"]
     assert marked[2].outliers[0].deviation == pytest.approx(3.0)
-    assert "rotation_z +3 deg" in str(marked[2].outliers[0])
+    assert "rotation_z +3.00 deg" in str(marked[2].outliers[0])
 
 
 @given(st.integers(0, 10_000))

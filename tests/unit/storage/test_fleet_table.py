@@ -98,7 +98,7 @@ def test_a_failed_drive_is_a_row_with_its_reason(tmp_path: Path) -> None:
 def test_outliers_are_told_in_words() -> None:
     outliers = (Outlier("t_x (mm)", 37.81, 9.94), Outlier("H_z (uT)", -2.0, 5.5))
     told = flat(row(0, outliers=outliers))["outliers"]
-    assert told == "t_x +37.8 mm, 9.9 times expected; H_z -2 uT, 5.5 times expected"
+    assert told == "t_x +37.8 mm, 9.9 times expected; H_z -2.00 uT, 5.5 times expected"
 
 
 def test_without_pyarrow_the_line_names_the_extra(
