@@ -125,13 +125,17 @@ def test_the_page_defines_and_prints_what_a_certificate_needs(
         "Rz(yaw) Ry(pitch) Rx(roll)",
         "poses.tum",
         "sha256 cd34",
-        *("C_xx", "C_zz", "H_z", "time offset (s)", "roll (°)"),
+        *("C_xx", "C_zz", "H_z", "time offset (s)", "roll, pitch, yaw (°)"),
         *("covariance_order", "position_sigma_m", "graph_iterations: 2", "Account of its readings"),
     ):
         assert words in printed, words
     assert "<b>Muster" not in page
     style = page[page.index("@media print") :]
     assert re.search(r"\.folded \{ display: block;", style)
+    kept = printed[printed.index('<div class="kept">') : printed.index('<section id="annex"')]
+    assert 'id="provenance"' in kept  # the signature has company on its page
+    assert 'id="signature"' in kept
+    assert re.search(r"\.kept \{ break-inside: avoid;", style)
     assert printed.count('class="folded"') == page.count('<details class="fold">') == 5
 
 
