@@ -266,7 +266,11 @@ def verdict_text(result: CalibrationResult, source: SourceFile) -> str:
     content = {
         "format": "l2m-verdict",
         "version": 1,
-        "calibration": {"path": Path(source.path).name, "sha256": source.sha256},
+        "calibration": {
+            "path": Path(source.path).name,
+            "sha256": source.sha256,
+            **({"report_id": result.report_id} if result.report_id else {}),
+        },
         "verdict": verdict,
     }
     return json.dumps(content, ensure_ascii=False)

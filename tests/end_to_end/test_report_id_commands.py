@@ -123,3 +123,10 @@ def test_map_info_names_suite_and_survey(place: CalibratedYard, tmp_path: Path) 
     out = l2m("map", "info", path).out
     assert f"suite.yaml, {'ab' * 32}" in out
     assert str(state.provenance["surveyed"]["begun"])[:10] in out
+
+
+def test_what_is_exported_names_the_report(place: CalibratedYard, tmp_path: Path) -> None:
+    report_id = read_calibration(place.calibration).report_id
+    for name in ("json", "urdf", "kalibr", "px4"):
+        l2m("export", place.calibration, "--format", name, "--out", tmp_path / name)
+        assert report_id in (tmp_path / name).read_text()

@@ -66,6 +66,7 @@ class Export:
         sources += [("map", self.result.map)] if self.result.map else []
         for name, source in sources:
             lines.append(f"{name}: {Path(source.path).name}, sha256 {source.sha256}")
+        lines += [f"report id: {self.result.report_id}"] if self.result.report_id else []
         lines += [f"left out: {name}: {reason}" for name, reason in self.left_out.items()]
         lines += judged_lines(self.result.judgement)
         return tuple(_printable(line) for line in lines)

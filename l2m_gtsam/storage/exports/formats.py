@@ -43,6 +43,7 @@ def json_text(export: Export) -> str:
     content = {
         "format": "l2m-export",
         "version": 1,
+        **({"report_id": result.report_id} if result.report_id else {}),
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL, "infinite": UNKNOWN},
         "verdict": verdict,
         "lidar_frame": export.lidar_frame,
