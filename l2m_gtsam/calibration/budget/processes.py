@@ -307,14 +307,28 @@ class FloorModes:
 
     def values(self, x: FloatArray) -> FloatArray:
         """Return the modes, of mean square one over the floor, at places (n, 3): shape (n, J)."""
-        phase = np.pi * (x[:, :2] - self.low) / self.length
-        norm = np.sqrt(np.where(self.waves, 2.0, 1.0)).prod(axis=1)
-        return np.asarray(norm * np.cos(phase[:, None] * self.waves).prod(axis=2))
+        return np.asarray(self._norm * np.cos(self._phase(x)).prod(axis=2))
+
+    def slopes(self, x: FloatArray) -> FloatArray:
+        """Return their derivatives along x and y at places (n, 3) in 1/m, shape (n, J, 2)."""
+        phase = self._phase(x)
+        falling = -np.sin(phase) * (np.pi * self.waves / self.length)
+        return np.asarray(self._norm[:, None] * falling * np.cos(phase)[:, :, ::-1])
+
+    @property
+    def _norm(self) -> FloatArray:
+        return np.asarray(np.sqrt(np.where(self.waves, 2.0, 1.0)).prod(axis=1))
+
+    def _phase(self, x: FloatArray) -> FloatArray:
+        return np.asarray((np.pi * (x[:, :2] - self.low) / self.length)[:, None] * self.waves)
 
 
 @dataclass(frozen=True)
 class Warp:
-    """The drive's frame is bent against the map's, in the plane of the floor."""
+    """The drive's frame is bent against the map's, in the plane of the floor.
+
+    Poses on a bent frame are shifted, and turned with it: by half the curl of the shifts.
+    """
 
     places: ReadingPlaces
     modes: FloorModes
@@ -325,7 +339,7 @@ class Warp:
     def of(cls, places: ReadingPlaces) -> "Warp":
         """Return the modes over the floor of some readings."""
         finest = np.sqrt(-2 * np.log(FAINT)) / min(WARP_M)  # wavenumber that still counts
-        return cls(places, FloorModes.over(places.x, finest))
+        return cls(places, FloorModes.over(places.readings.p_map_lidar, finest))
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
@@ -335,8 +349,14 @@ class Warp:
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what shifts along x and y of the map make of the field, shape (n, 3, m)."""
-        slope = self.places.slope[rows, :, :2]
-        return times_modes(slope, self.modes.values(self.places.x[rows]))
+        places, unit = self.places, np.broadcast_to(np.eye(6), (len(rows), 6, 6))
+        R, p = places.readings.R_map_lidar[rows], places.readings.p_map_lidar[rows]
+        slope = places.slope[rows]
+        F = pose_features(unit, places.b_lidar[rows], slope @ R, places.t[rows])
+        turn = np.einsum("nia,na->ni", F[:, :, :3], R[:, 2])  # about the map's vertical axis
+        curl = self.modes.slopes(p)[:, :, ::-1] * [-1.0, 1.0]  # of a shift along x, and along y
+        by_turn = np.einsum("ni,nja->nija", turn, 0.5 * curl).reshape(len(rows), 3, -1)
+        return np.asarray(times_modes(slope[:, :, :2], self.modes.values(p)) + by_turn)
 
     def on(self, places: ReadingPlaces) -> "Warp":
         """Return the same modes in other readings."""

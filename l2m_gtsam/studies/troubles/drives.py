@@ -112,12 +112,16 @@ def pink(count: int, rng: np.random.Generator) -> FloatArray:
 
 
 def bent(true: Trajectory, options: TroublesOptions, rng: np.random.Generator) -> Trajectory:
-    """Return poses in a frame that is bent: a slow wave along x and along y."""
+    """Return poses in a frame that is bent: slow waves along x and y, and headings with them."""
     wave = 2 * np.pi / options.warp_length_m
     phase = rng.uniform(-np.pi, np.pi, (2, 2))
-    along = np.sin(wave * true.p[:, None, :2] + phase).mean(axis=2)
-    shift = np.column_stack([options.warp_m * along, np.zeros(len(along))])
-    return replace(true, p=true.p + shift)
+    at = wave * true.p[:, None, :2] + phase  # of the shift along each axis, along each axis
+    shift = np.column_stack([options.warp_m * np.sin(at).mean(axis=2), np.zeros(len(at))])
+    slope = 0.5 * options.warp_m * wave * np.cos(at)
+    turn = np.zeros_like(shift)
+    turn[:, 2] = 0.5 * (slope[:, 1, 0] - slope[:, 0, 1])  # half the curl
+    R = Rotation.from_rotvec(turn).as_matrix() @ true.R
+    return replace(true, R=R, p=true.p + shift)
 
 
 def misplaced(true: Trajectory, options: TroublesOptions, rng: np.random.Generator) -> Trajectory:

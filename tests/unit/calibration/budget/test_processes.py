@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from l2m_factors import PoseMotion, moved
 from l2m_gtsam.calibration.budget.clock import ClockDrift
@@ -80,6 +81,36 @@ def test_a_warp_has_a_metre_square_wherever_it_is() -> None:
     for spectrum in warp.forms[0]:
         variance = warp.modes.values(PLACES.x) ** 2 @ spectrum[::2]
         assert np.mean(variance) == pytest.approx(1, abs=0.35)  # of few modes, over a lane
+
+
+def test_features_of_a_warp_are_those_of_poses_on_a_bent_frame() -> None:
+    """Shifted, and turned by half the curl, by central differences in a field of one gradient."""
+    rng, rows = np.random.default_rng(4), np.arange(40)
+    G, B = rng.standard_normal((3, 3)), np.array([20.0, 5.0, -40.0])
+    R, p, t = READINGS.R_map_lidar, READINGS.p_map_lidar, PLACES.t
+
+    def field(R: FloatArray, p: FloatArray) -> FloatArray:
+        x = np.einsum("nij,nj->ni", R, t) + p
+        return np.asarray(np.einsum("nji,nj->ni", R, B + x @ G.T))
+
+    places = replace(PLACES, b_lidar=field(R, p), slope=R.transpose(0, 2, 1) @ G)
+    warp = Warp.of(places)
+    weights = rng.standard_normal(2 * len(warp.modes.waves))
+
+    def shift(p: FloatArray) -> FloatArray:
+        return np.asarray(warp.modes.values(p) @ weights.reshape(-1, 2))
+
+    def bent(size: float) -> FloatArray:
+        h = 1e-5
+        dx, dy = ((shift(p + h * e) - shift(p - h * e)) / (2 * h) for e in np.eye(3)[:2])
+        turn = np.zeros_like(p)
+        turn[:, 2] = 0.5 * size * (dx[:, 1] - dy[:, 0])
+        moved = p + size * np.column_stack([shift(p), np.zeros(len(p))])
+        return field(Rotation.from_rotvec(turn).as_matrix() @ R, moved)
+
+    step = 1e-5
+    expected = (bent(step) - bent(-step)) / (2 * step)
+    np.testing.assert_allclose(warp.features(rows) @ weights, expected[rows], atol=1e-5)
 
 
 def test_features_of_wander_add_to_the_readings_along_their_axes() -> None:
