@@ -120,7 +120,7 @@ def test_a_magnet_on_the_vehicle_is_named(
     found = validate_calibration(asked, silent)
     told = "\n".join(found.verdict.lines(Level.PASS))
     assert "verdict: FAIL" in told
-    assert "On this drive its offset H is not as calibrated, by 3 µT" in told
+    assert "On this drive its offset H is not as calibrated, by 3.0 µT" in told
     assert read_validation(tmp_path / "out" / "validation.json").verdict == found.verdict
     assert {each.role for each in found.sources} == {"calibration", "drive", "map"}
 
