@@ -10,7 +10,15 @@ from l2m_factors import T
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, reading_graph
 from l2m_gtsam.calibration.optimise import Optimizer, optimise
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.view import QueryableMap, StandIns, View, glimpse, seen_from
+from l2m_gtsam.calibration.view import (
+    QueryableMap,
+    StandIns,
+    View,
+    glimpse,
+    has_left,
+    inside_of_each,
+    seen_from,
+)
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.options import Options
 from l2m_gtsam.progress import Progress
@@ -131,13 +139,16 @@ def alternate(
     """Alternate closed form and translation graph until no sensor moves further than settled.
 
     It only has to come near: `alternation_readings` of each sensor are enough, with the map's
-    variance at fewer yet, which is asked for anew only where sensors have moved.
+    variance at fewer yet, which is asked for anew only where sensors have moved. A sensor that
+    nothing holds in the map, as in a field that is the same everywhere, stays where it started.
     """
     estimate, furthest = start, options.settled_m
     view, asked, step = glimpse(readings, stand_ins, field_map, start, start.t, FEWEST), start.t, 0
+    begun, lost = inside_of_each(readings, view), np.zeros(len(start.t), dtype=np.bool_)
     while view.sensors and step < options.max_steps:
         step += 1
         moved = move_sensors(view, field_map, fit_distortions(view, estimate, options), options)
+        moved = replace(moved, t=np.where(lost[:, None], start.t, moved.t))
         move = float(np.abs(moved.t - estimate.t).max())
         estimate, furthest = moved, max(furthest, move)
         progress("alternation", _share_done(move, furthest, options.settled_m))
@@ -148,6 +159,12 @@ def alternate(
         else:
             asked = estimate.t
             view = glimpse(readings, stand_ins, field_map, estimate, asked, FEWEST)
+            gone = has_left(readings, view, begun)
+            if gone.any():
+                lost |= gone
+                estimate = replace(estimate, t=np.where(lost[:, None], start.t, estimate.t))
+                asked = estimate.t
+                view = glimpse(readings, stand_ins, field_map, estimate, asked, FEWEST)
     return Alternated(estimate, asked, step)
 
 

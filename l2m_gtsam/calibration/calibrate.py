@@ -273,13 +273,15 @@ def _nothing_solved(
 ) -> str:
     """Return why; ``covered`` is whether the map has data where the lidar was."""
     place = map_source.path if map_source else "the map"
-    if covered:
+    unsolved = f"{recording.source.path}: no sensor can be solved"
+    outside = [each for each in sensors if each.status is SensorStatus.OUTSIDE_MAP]
+    first = (outside or sensors)[0]
+    if covered and outside:
         return (
-            f"{recording.source.path}: no sensor can be solved, although {place} covers the drive: "
-            f"{sensors[0].sensor}: {sensors[0].message}; is it the map of another place, or is the "
-            "start of a sensor wrong?"
+            f"{unsolved}, although {place} covers the drive: {first.sensor}: {first.message}; is "
+            "it the map of another place, or is the start of a sensor wrong?"
         )
-    if any(sensor.status is SensorStatus.OUTSIDE_MAP for sensor in sensors):
+    if outside:
         low, high = recording.trajectory.p.min(axis=0), recording.trajectory.p.max(axis=0)
         return (
             f"{place} does not cover the drive {recording.source.path}, which runs from "
@@ -287,4 +289,4 @@ def _nothing_solved(
             f"{high[2]:.1f}) m in frame {recording.trajectory.frame!r}: is it another place or "
             "another map frame?"
         )
-    return f"{recording.source.path}: no sensor can be solved: {sensors[0].message}"
+    return f"{unsolved}: {first.sensor}: {first.message}"

@@ -5,6 +5,7 @@ was rejected is where a change is plainest. Then the map is given the sources an
 solved again, with the sources as variables beside the sensors: readings that they explain count.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,11 +71,13 @@ class ChangedSources:
 
 
 def averaged_drive(
-    solution: OneKeySolution, field_map: QueryableMap, options: AveragingOptions
+    solution: OneKeySolution,
+    sensors: Sequence[int],
+    field_map: QueryableMap,
+    options: AveragingOptions,
 ) -> AveragedDrive:
-    """Return averages of a solve's readings inside the map, rejected ones among them."""
-    solved = [each.sensor for each in solution.solved]
-    inside = solution.inside & np.isin(solution.readings.sensor, solved)
+    """Return averages of readings of solved sensors inside the map, rejected ones among them."""
+    inside = solution.inside & np.isin(solution.readings.sensor, sensors)
     readings = solution.readings.select(inside)
     estimate = solution.estimate
     averages = averaged(readings, field_map, estimate, solution.used[inside], options)
@@ -140,11 +143,11 @@ def search(
     known
         Sources that were found before, which the solve knows of.
     """
-    if not options.sources.most or not isinstance(field_map, UncertainMap) or not solution.solved:
+    if not options.sources.most or not isinstance(field_map, UncertainMap) or not solution.placed:
         return None
     if not is_place_of(field_map):
         return None
-    drive = averaged_drive(solution, field_map, options.averaging)
+    drive = averaged_drive(solution, solution.placed, field_map, options.averaging)
     places = suspected(drive, field_map, options.averaging)
     if not len(places) and known is None:
         return None

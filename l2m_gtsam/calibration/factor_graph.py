@@ -1,6 +1,6 @@
 """The calibration as a factor graph: readings in, ``T(i)`` and ``D(i)`` out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -84,9 +84,16 @@ class Estimate:
             values.insert(S(sensor), float(self.offset[sensor]))
         return values
 
-    def same_noise(self, other: "Estimate") -> bool:
-        """Return whether no sensor's noise differs by more than 0.1 %."""
-        return bool(np.abs(np.log(self.noise / other.noise)).max() < 1e-3)
+    def same_noise(self, other: "Estimate", sensor: int) -> bool:
+        """Return whether a sensor's noise does not differ by more than 0.1 %."""
+        return bool(abs(np.log(self.noise[sensor] / other.noise[sensor])) < 1e-3)
+
+    def as_in(self, other: "Estimate", sensors: Sequence[int]) -> "Estimate":
+        """Return the estimate with t, C and H of some sensors as another has them."""
+        t, distortion = self.t.copy(), self.distortion.copy()
+        at = list(sensors)
+        t[at], distortion[at] = other.t[at], other.distortion[at]
+        return replace(self, t=t, distortion=distortion)
 
     def updated(self, values: gtsam.Values, sensors: list[int]) -> "Estimate":
         """Return the estimate with these sensors' T(i), and the rest where present, taken over."""

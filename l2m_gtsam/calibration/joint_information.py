@@ -213,12 +213,23 @@ class JointInformation:
         """Return the covariance of all parameters of some sensors, shape (16 n, 16 n)."""
         return self.covariance([key for sensor in sensors for key in keys_of(sensor)])
 
-    def sigmas(self, sensor: int) -> float:
-        """Return the length of a sensor's step in standard deviations."""
+    def sigmas(self, sensor: int, along: FloatArray | None = None) -> float:
+        """Return the length of a sensor's step in standard deviations.
+
+        Parameters
+        ----------
+        sensor
+            Index of the sensor.
+        along
+            Rows over its parameters that are looked at alone, shape (K, 16).
+        """
         covariance = self.among((sensor,))
+        step = self.step[columns_at(self.columns, keys_of(sensor))]
+        if along is not None:
+            covariance, step = along @ covariance @ along.T, along @ step
         sigma = np.sqrt(np.diag(covariance))
         lower = cholesky(covariance / np.outer(sigma, sigma), lower=True)
-        step = self.step[columns_at(self.columns, keys_of(sensor))] / sigma
+        step = step / sigma
         return float(np.sqrt(step @ cho_solve((lower, True), step)))
 
     def furthest(self, sensors: Sequence[int]) -> float:

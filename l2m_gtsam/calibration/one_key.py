@@ -38,6 +38,7 @@ from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.calibration.parts_alone import ByParts
 from l2m_gtsam.calibration.pose_durations import duration_of_poses
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
+from l2m_gtsam.calibration.stayed import stayed, without
 from l2m_gtsam.calibration.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.calibration.uncertain import (
     UncertainSolution,
@@ -52,6 +53,8 @@ from l2m_gtsam.calibration.view import (
     StandIns,
     View,
     glimpse,
+    has_left,
+    inside_of_each,
     observe,
     places_of,
     remembered,
@@ -64,7 +67,7 @@ from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.records.error_budget import PoseDuration, StatedSize
-from l2m_gtsam.solve.rank import Determinacy
+from l2m_gtsam.solve.rank import Determinacy, RankOptions
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or
 # three rounds, and a set of readings that keeps hopping over the map's edge is cut off here.
@@ -94,8 +97,8 @@ class OneKeySolution:
         Alternations taken.
     ending
         How the last joint optimisation ended.
-    settled
-        Whether estimate and weights agree: another round would repeat the last.
+    unsettled
+        Sensors whose estimate or weights another round would change.
     uncertainty
         How the map's errors were counted: full needs a map that knows them.
     budget
@@ -108,6 +111,8 @@ class OneKeySolution:
         The sensors by the scatter of parts of the drive alone, where that is asked for.
     unseen_warp_m
         As of ``UncertainSolution``.
+    stayed
+        Sensors that the solve drives out of the map: they are where they started.
     """
 
     readings: Readings
@@ -117,18 +122,29 @@ class OneKeySolution:
     rejected: BoolArray
     steps: int
     ending: Ending
-    settled: bool
+    unsettled: frozenset[int]
     uncertainty: Uncertainty = Uncertainty.INDEPENDENT
     budget: Budget = NOTHING_FOUND
     stated: tuple[StatedSize, ...] = ()
     pose_duration: PoseDuration | None = None
     by_parts: tuple[ByParts, ...] = ()
     unseen_warp_m: float | None = None
+    stayed: frozenset[int] = frozenset()
 
     @property
     def used(self) -> BoolArray:
         """Which readings count, shape (N,)."""
         return self.inside & ~self.rejected
+
+    @property
+    def placed(self) -> tuple[int, ...]:
+        """Solved sensors whose place is an optimum in the map."""
+        return tuple(each.sensor for each in self.solved if each.sensor not in self.stayed)
+
+    @property
+    def settled(self) -> bool:
+        """Whether estimate and weights agree: another round would repeat the last."""
+        return not self.unsettled | self.stayed
 
 
 def solve_one_key(
@@ -260,22 +276,26 @@ def _solved(
     start = start_estimate(t_start, options, priors)
     near = alternate(some, of_some, field_map, start, options, progress)
     joint = settle(readings, stand_ins, field_map, near, options, progress, trajectory)
+    alone = stayed(joint.stayed, joint.readings, field_map, joint.estimate, options)
+    joint = replace(joint, estimate=alone.estimate)
     outcome = OneKeySolution(
         readings=joint.readings,
         estimate=joint.estimate,
-        solved=(),
+        solved=alone.solved,
         inside=joint.whole.inside,
-        rejected=joint.rejected,
+        rejected=joint.rejected | alone.rejected,
         steps=near.steps,
         ending=joint.ending,
-        settled=joint.settled,
+        unsettled=joint.unsettled,
+        stayed=joint.stayed,
     )
     if joint.problem is None:
         return outcome
     view, tests = joint.problem.view, joint.problem.determinacies
     errors = shared_errors(field_map, view.readings, options.uncertainty)
     if errors is None:
-        return replace(outcome, solved=finish.independent(joint.problem, joint.estimate))
+        found = finish.independent(joint.problem, joint.estimate)
+        return replace(outcome, solved=in_order(found, alone.solved))
     if duration := duration_of_poses(view, field_map, joint.estimate, options.pose_noise):
         pose_noise = options.pose_noise.lasting(duration.seconds)
         options = options.model_copy(update={"pose_noise": pose_noise})
@@ -286,9 +306,9 @@ def _solved(
     return replace(
         outcome,
         estimate=full.estimate,
-        solved=full.solved,
+        solved=in_order(full.solved, alone.solved),
         ending=full.ending,
-        settled=joint.settled and full.settled,
+        unsettled=joint.unsettled | full.unsettled,
         uncertainty=Uncertainty.INDEPENDENT if unshared else Uncertainty.FULL,
         budget=full.budget,
         stated=full.stated,
@@ -296,6 +316,11 @@ def _solved(
         by_parts=full.by_parts,
         unseen_warp_m=full.unseen_warp_m,
     )
+
+
+def in_order(*parts: tuple[SensorSolution, ...]) -> tuple[SensorSolution, ...]:
+    """Return the solutions of all sensors in the order of these."""
+    return tuple(sorted((each for part in parts for each in part), key=lambda each: each.sensor))
 
 
 def remember_near(field_map: RememberedMap, joint: "Joint", estimate: Estimate) -> None:
@@ -342,8 +367,11 @@ class Joint:
         The graph of those that count; none if no sensor has enough.
     ending
         How the last optimisation ended.
-    settled
-        Whether another round would repeat the last.
+    unsettled
+        Sensors whose estimate or weights another round would change.
+    stayed
+        Sensors that left the map, and are where the rounds began; their readings are not among
+        those inside.
     """
 
     readings: Readings
@@ -353,7 +381,8 @@ class Joint:
     weights: FloatArray
     problem: JointProblem | None
     ending: Ending
-    settled: bool
+    unsettled: frozenset[int]
+    stayed: frozenset[int]
 
     @property
     def rejected(self) -> BoolArray:
@@ -375,39 +404,83 @@ def settle(
     """Solve the joint graph again and again, until the weights are those of its result.
 
     That is the graduated loop too: each round trusts readings as the residuals of the last say.
+    Sensors that leave the map go back to where they were, and take no part any more.
     """
     # The first round moves all sensors: a few readings' variance is enough for it.
     estimate, least = near.estimate, options.min_readings
     whole = glimpse(readings, stand_ins, field_map, estimate, near.asked, least)
+    begun, gone = inside_of_each(readings, whole), frozenset[int]()
     asked = np.full((len(whole.readings), 3), np.inf)
-    ending, settled = Ending.TOLERANCE, False
+    ending, unsettled = Ending.TOLERANCE, frozenset(range(len(estimate.t)))
     last: Trusted | None = None
     problem: JointProblem | None = None
     for round_ in range(MAX_ROUNDS):
         progress("joint graph", round_ / MAX_ROUNDS)
         now = trusted(whole, field_map, estimate, options, round_, last)
         if not now.view.sensors:
-            weights = now.weights
-            return Joint(readings, estimate, whole, asked, weights, None, ending, settled=False)
+            return Joint(
+                readings, estimate, whole, asked, now.weights, None, ending, unsettled - gone, gone
+            )
         problem = joint_problem(now.view, field_map, estimate, options)
         step = joint_step(problem, estimate, options, exact=now.agrees(last))
-        moved = float(np.abs(step.estimate.t - estimate.t).max())
+        unsettled = frozenset(
+            s
+            for s in now.view.sensors
+            if is_changing(s, problem, estimate, step.estimate, options.rank)
+            or not now.agrees_on(s, last)
+        )
         late = float(np.abs(step.estimate.offset - estimate.offset).max())
-        quiet = moved < SETTLED_M and late < SETTLED_S and step.estimate.same_noise(estimate)
-        settled = quiet and now.agrees(last)
         estimate, ending, last = step.estimate, step.ending, now
-        if settled:
+        if not unsettled:
             break
         if late > SETTLED_S and trajectory is not None:
             readings = with_offsets(readings, trajectory, estimate.offset)
             whole = replace(whole, readings=readings[whole.rows])
         if np.abs(places_of(whole.readings, estimate.t) - asked).max() > REOBSERVE_M:
             whole = observe(readings, field_map, estimate, options.min_readings)
+            if (left := has_left(readings, whole, begun)).any():
+                gone |= frozenset(np.flatnonzero(left).tolist())
+                t = np.where(left[:, None], near.estimate.t, estimate.t)
+                estimate = replace(estimate, t=t)
+                whole = observe(readings, field_map, estimate, options.min_readings)
+            whole = without(whole, gone)
             asked = places_of(whole.readings, estimate.t)
         else:
             whole = seen_from(whole, field_map, estimate)
     progress("joint graph", 1.0)
-    if last is None or not settled:  # the last round's weights are not those of its result
+    if last is None or unsettled:  # the last round's weights are not those of its result
         last = trusted(whole, field_map, estimate, options, MAX_ROUNDS, None)
         problem = joint_problem(last.view, field_map, estimate, options)
-    return Joint(readings, estimate, whole, asked, last.weights, problem, ending, settled)
+    return Joint(
+        readings, estimate, whole, asked, last.weights, problem, ending, unsettled - gone, gone
+    )
+
+
+def is_changing(
+    sensor: int, problem: JointProblem, before: Estimate, after: Estimate, options: RankOptions
+) -> bool:
+    """Return whether a sensor moved in a round, or its clock, or its noise differs.
+
+    Where they leave its place open it may go wherever it likes along what they do not determine.
+
+    Parameters
+    ----------
+    sensor
+        Index of the sensor.
+    problem
+        The round.
+    before, after
+        Estimates before and after it.
+    options
+        The scales of the rank test.
+    """
+    step = after.t[sensor] - before.t[sensor]
+    test = problem.determinacies[sensor]
+    if test.place_open:
+        known = test.determined
+        scale = options.scale()
+        whole = (after.vector(sensor) - before.vector(sensor)) / scale
+        step = (scale * (known.T @ (known @ whole)))[:3]
+    late = abs(after.offset[sensor] - before.offset[sensor])
+    moved = float(np.abs(step).max()) >= SETTLED_M or late >= SETTLED_S
+    return moved or not after.same_noise(before, sensor)

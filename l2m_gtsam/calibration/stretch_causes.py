@@ -57,7 +57,8 @@ def with_causes(
     """
     if not stretches or not isinstance(field_map, UncertainMap) or not is_place_of(field_map):
         return stretches
-    drive = averaged_drive(solution, field_map, options.averaging)
+    solved = [each.sensor for each in solution.solved]
+    drive = averaged_drive(solution, solved, field_map, options.averaging)
     rows = drive.marginal(field_map, field_map, solution.budget, options.averaging)
     places = DisagreeingPlaces.of(rows, drive)
     return tuple(replace(each, explanations=places.explanations(each)) for each in stretches)

@@ -11,7 +11,7 @@ import numpy as np
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
 from l2m_gtsam.calibration.view import QueryableMap, View
-from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings
+from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, Readings
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 from l2m_gtsam.solve.robust import (
     WEIGHTS,
@@ -39,13 +39,14 @@ class Trusted:
     ----------
     view
         Those readings with their weights.
-    weights
+    sensor, weights
         Of all readings of the whole view, shape (N,).
     final
         Whether the graduation is over.
     """
 
     view: View
+    sensor: IntArray
     weights: FloatArray
     final: bool
 
@@ -55,6 +56,13 @@ class Trusted:
             return False
         same = np.array_equal(self.weights > NOTHING, other.weights > NOTHING)
         return self.final and other.final and same
+
+    def agrees_on(self, sensor: int, other: "Trusted | None") -> bool:
+        """Return whether both leave out the same readings of a sensor, and will go on to do so."""
+        if other is None:
+            return False
+        own = [each.weights[each.sensor == sensor] > NOTHING for each in (self, other)]
+        return self.final and other.final and np.array_equal(*own)
 
 
 def plausible(readings: Readings, sample: FieldSample, options: RobustOptions) -> BoolArray:
@@ -181,7 +189,7 @@ def counting(view: View, weights: FloatArray, min_readings: int, *, final: bool)
         rows=view.rows[keep],
         sensors=sensors,
     )
-    return Trusted(kept, weights, final)
+    return Trusted(kept, sensor, weights, final)
 
 
 def residuals(readings: Readings, field_map: QueryableMap, estimate: Estimate) -> FloatArray:

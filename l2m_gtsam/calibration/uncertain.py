@@ -25,18 +25,23 @@ from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, Searched
 from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
+from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver
 from l2m_gtsam.calibration.parts_alone import ByParts
+from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.stated_sizes import leave_noise
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import ROUND_SIGMAS, THERE_SIGMAS, UncertainProblem
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap, View
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.parallel.threads import side_by_side
 from l2m_gtsam.records.error_budget import StatedSize
-from l2m_gtsam.solve.rank import Determinacy
+from l2m_gtsam.solve.rank import Determinacy, RankOptions
 
 MAX_ROUNDS = 6
+# Where places are open errors of the map stand in for them, and steps overshoot.
+ROUNDS_OF_OPEN = 20
 SEARCHED = 0.6  # of the way, when it is known which processes a drive has
 SETTLED_SIGMAS = 0.1  # what such a step is at most in the last round
 
@@ -53,8 +58,8 @@ class UncertainSolution:
         Covariance and figures of each.
     ending
         How the last optimisation ended.
-    settled
-        Whether another round would repeat the last.
+    unsettled
+        Sensors whose estimate or weights another round would change.
     budget
         Processes that were found in what noise and map leave.
     stated
@@ -69,11 +74,16 @@ class UncertainSolution:
     estimate: Estimate
     solved: tuple[SensorSolution, ...]
     ending: Ending
-    settled: bool
+    unsettled: frozenset[int]
     budget: Budget = NOTHING_FOUND
     stated: tuple[StatedSize, ...] = ()
     by_parts: tuple[ByParts, ...] = ()
     unseen_warp_m: float | None = None
+
+    @property
+    def settled(self) -> bool:
+        """Whether another round would repeat the last."""
+        return not self.unsettled
 
 
 def solve_uncertain(
@@ -134,7 +144,7 @@ def solve_uncertain(
         estimate=found.estimate,
         solved=solved,
         ending=found.ending,
-        settled=found.settled,
+        unsettled=found.unsettled,
         budget=found.drive.budget,
         stated=stated,
         unseen_warp_m=size,
@@ -159,7 +169,7 @@ def check_by_parts(
         found.estimate,
         found.optimum.solutions(),
         found.ending,
-        found.settled,
+        found.unsettled,
         by_parts=found.optimum.by_parts(),
     )
 
@@ -273,7 +283,7 @@ def step_uncertain(
             break
     estimate = near.updated(step.values, view.sensors)
     solved = UncertainOptimum.at(problem, step.values).solutions()
-    return UncertainSolution(estimate, solved, step.ending, settled=True)
+    return UncertainSolution(estimate, solved, step.ending, frozenset())
 
 
 @dataclass(frozen=True)
@@ -304,14 +314,14 @@ class Settled:
         All sensors there, with their noise.
     ending
         How the last optimisation ended.
-    settled
-        Whether another round would repeat the last.
+    unsettled
+        Sensors whose estimate or weights another round would change.
     """
 
     optimum: UncertainOptimum
     estimate: Estimate
     ending: Ending
-    settled: bool
+    unsettled: frozenset[int]
 
     @property
     def drive(self) -> UncertainDrive:
@@ -345,28 +355,75 @@ def settle(
     progress
         Called with the fraction that is done.
     """
-    sensors, settled = drive.view.sensors, False
+    sensors = drive.view.sensors
+    unsettled = frozenset(sensors)
     values, near = begin.values, begin.near
-    ending = Ending.TOLERANCE
-    for round_ in range(MAX_ROUNDS):
-        problem = UncertainProblem(drive, estimate, tests, options.factors)
+    ending, begun = Ending.TOLERANCE, estimate
+    open_ = [s for s in sensors if tests[s].place_open]
+    for round_ in range(most := ROUNDS_OF_OPEN if open_ else MAX_ROUNDS):
+        held_at = estimate.as_in(begun, open_)  # else they slide on with each round
+        problem = UncertainProblem(drive, estimate, tests, options.factors, held_at)
         arrived = problem.arrive(values, options, solver, near=near)
         values, joint = arrived.values, arrived.joint
         optimum = UncertainOptimum(problem, values, joint)
         if arrived.ending is Ending.SINGULAR:
-            return Settled(optimum, estimate, arrived.ending, settled=False)
+            return Settled(optimum, estimate, arrived.ending, frozenset(sensors))
         if not near:  # then it was a descent
             ending = arrived.ending
         near = joint.furthest(sensors) < ROUND_SIGMAS
         after = estimate.updated(values, sensors)
         if options.sensor_noise_ut is None:
             after = replace(after, noise=optimum.noise())
-        at_rest = joint.furthest(sensors) < SETTLED_SIGMAS and joint.decrement < THERE_SIGMAS
         # The first weights are those of the optimum with independent errors, if none is predicted.
-        weighed = round_ > 0 or begin.near
-        settled = weighed and at_rest and problem.same_noise(after, estimate)
+        if round_ > 0 or begin.near:
+            unsettled = still_changing(problem, joint, after, estimate, options.rank)
         estimate = after
-        if settled:
+        if not unsettled:
             break
-        progress((round_ + 2) / (MAX_ROUNDS + 1))
-    return Settled(optimum, estimate, ending, settled)
+        progress((round_ + 2) / (most + 1))
+    return Settled(optimum, estimate, ending, unsettled)
+
+
+def still_changing(
+    problem: UncertainProblem,
+    joint: JointInformation,
+    after: Estimate,
+    before: Estimate,
+    options: RankOptions,
+) -> frozenset[int]:
+    """Return the sensors that another round would change: all if it is what they share.
+
+    One whose place is open may go wherever it likes along what its readings do not determine.
+
+    Parameters
+    ----------
+    problem
+        The round.
+    joint
+        All variables together, a step before the end of it.
+    after, before
+        Sensors with their noise at its end and in its weights.
+    options
+        The scales of the rank test.
+    """
+    sensors = problem.drive.view.sensors
+    changing = frozenset(
+        s
+        for s in sensors
+        if joint.sigmas(s, determined_rows(problem.tests[s], options)) >= SETTLED_SIGMAS
+        or not problem.same_noise(after, before, s)
+    )
+    return changing or frozenset(sensors if joint.decrement >= THERE_SIGMAS else ())
+
+
+def determined_rows(test: Determinacy, options: RankOptions) -> FloatArray | None:
+    """Return rows over the 16 parameters of a sensor whose place is open: what is determined.
+
+    None for others, of which all is looked at.
+    """
+    if not test.place_open:
+        return None
+    known = test.determined / options.scale()
+    rows = np.zeros((len(known) + 1, SENSOR))
+    rows[:-1, :-1], rows[-1, -1] = known, 1.0
+    return rows

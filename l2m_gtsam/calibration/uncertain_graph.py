@@ -80,6 +80,8 @@ class UncertainProblem:
         Rank test of each sensor.
     factors
         One factor for a group of readings or one for each; the mathematics is the same.
+    held_at
+        Where directions are held that nothing determines; at the estimate if that is not given.
 
     Attributes
     ----------
@@ -101,6 +103,7 @@ class UncertainProblem:
         estimate: Estimate,
         tests: Mapping[int, Determinacy],
         factors: FactorForm,
+        held_at: Estimate | None = None,
     ) -> None:
         view, field_map, coverage = drive.view, drive.field_map, drive.prior.coverage
         self.drive, self.estimate, self.tests = drive, estimate, tests
@@ -112,7 +115,8 @@ class UncertainProblem:
                 coverage.groups, self.noise.errors, self.noise.whitenings, strict=True
             )
         ]
-        self._sensor_priors = prior_graph(estimate, {s: tests[s] for s in view.sensors})
+        own = {s: tests[s] for s in view.sensors}
+        self._sensor_priors = prior_graph(estimate if held_at is None else held_at, own)
         self.graph = gtsam.NonlinearFactorGraph()
         for readings in self.groups:
             self.graph.push_back(_factors(readings, factors))
@@ -195,16 +199,14 @@ class UncertainProblem:
         spread = self.drive.prior.coverage.spread
         return joint.loosened(U(), spread) if len(spread) else joint
 
-    def same_noise(self, one: Estimate, other: Estimate) -> bool:
-        """Return whether no reading's standard deviation differs by more than 0.1 % for it.
+    def same_noise(self, one: Estimate, other: Estimate, sensor: int) -> bool:
+        """Return whether no reading's standard deviation differs by more than 0.1 % for a sensor's.
 
         Beside errors of poses that last a moment, a sensor's noise may be as good as nothing.
         """
-        for s in self.drive.view.sensors:
-            rest = float(self.noise.rest[self.batch.rows_of(s)].mean())
-            if abs(np.log((one.noise[s] ** 2 + rest) / (other.noise[s] ** 2 + rest))) > 2e-3:
-                return False
-        return True
+        rest = float(self.noise.rest[self.batch.rows_of(sensor)].mean())
+        first, second = (each.noise[sensor] ** 2 + rest for each in (one, other))
+        return bool(abs(np.log(first / second)) <= 2e-3)
 
     def _columns(self) -> dict[int, slice]:
         """Return where each key's variables stand: weights first, then sensors."""

@@ -192,8 +192,9 @@ def _solved(
     status, message = _verdict(explained, solution, options)
     rotation = _no_rotation()
     axis = dead_axis(distortion.C)
-    # what is not determined may be short without a fault of the sensor
-    if axis and np.isfinite(found.covariance[3:12, 3:12].diagonal()).all():
+    # what is not determined, or fits no place, may be short without a fault of the sensor
+    fits = found.sensor not in solution.stayed
+    if fits and axis and np.isfinite(found.covariance[3:12, 3:12].diagonal()).all():
         status = SensorStatus.DEAD_AXIS
         message = f"the sensor's {axis} axis does not follow the field; check its wiring"
     else:
@@ -239,23 +240,28 @@ def _verdict(
 ) -> tuple[SensorStatus, str]:
     found, words = explained.solution, ". ".join(explained.words)
     open_ = f"this drive and map leave open: {words}" if words else ""
-    because = f"; {open_}" if words else ""
+    because = f"{open_}; " if words else ""  # what keeps it from converging comes first
     if abs(solution.estimate.offset[found.sensor]) >= options.largest_offset_s > 0:
         return SensorStatus.NOT_CONVERGED, (
-            f"its clock seems to be off by {options.largest_offset_s:g} s or more: correct its "
-            f"stamps, or raise `calibration.solve.largest_offset_s`{because}"
+            f"{because}its clock seems to be off by {options.largest_offset_s:g} s or more: "
+            "correct its stamps, or raise `calibration.solve.largest_offset_s`"
         )
-    if not solution.settled:
+    if found.sensor in solution.unsettled:
         return SensorStatus.NOT_CONVERGED, (
-            f"estimate and weights still change, round after round{because}"
+            f"{because}estimate and weights still change, round after round"
         )
-    if found.remaining_sigmas > CONVERGED_SIGMAS:
+    runs_away = found.sensor in solution.stayed
+    if found.remaining_sigmas > CONVERGED_SIGMAS and not runs_away:
         return SensorStatus.NOT_CONVERGED, (
-            f"{solution.ending.value}, {found.remaining_sigmas:.2g} standard deviations from the "
-            f"optimum{because}"
+            f"{because}{solution.ending.value}, {found.remaining_sigmas:.2g} standard deviations "
+            "from the optimum"
         )
     if words:
         return SensorStatus.UNDETERMINED, open_
+    if runs_away:
+        return SensorStatus.NOT_CONVERGED, (
+            "no place near where it started explains its readings: the solve leaves the map"
+        )
     known = f"; from priors: {', '.join(explained.from_priors)}" if explained.from_priors else ""
     return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings{known}"
 
@@ -302,12 +308,31 @@ def _why_silent(usable: int, counts: SyncCounts, moved: Movement, needed: int) -
     without = counts.without_regressor
     numbers = f", {without} without a recorded number" if without else ""
     beyond = f", {counts.saturated} beyond its range" if counts.saturated else ""
+    remedy = _remedy(counts, moved, needed)
     return (
         f"{reason}{usable} usable readings of {counts.received} received "
         f"({counts.not_finite} not finite, {counts.repeated} repeated, "
         f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap between poses, "
-        f"{counts.thinned} at a place already read{numbers}{beyond}), at least {needed} are needed"
+        f"{counts.thinned} at a place already read{numbers}{beyond}), at least {needed} "
+        f"are needed: {remedy}"
     )
+
+
+def _remedy(counts: SyncCounts, moved: Movement, needed: int) -> str:
+    """Return what gives a sensor more usable readings, by why most of them do not count."""
+    if moved.at_rest:
+        return "drive"
+    if counts.received < needed:
+        return "drive on, or record its readings more often"
+    lost = {
+        "check the sensor and its driver": counts.not_finite + counts.repeated,
+        "record poses over the whole drive": counts.outside_trajectory,
+        "record poses without gaps": counts.in_pose_gap,
+        "drive on, through more places": counts.thinned,
+        "record the number over the whole drive": counts.without_regressor,
+        "choose a larger range, or keep the vehicle's iron away": counts.saturated,
+    }
+    return max(lost, key=lambda each: lost[each])
 
 
 def _no_rotation() -> PolarRotation:

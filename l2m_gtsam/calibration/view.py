@@ -20,6 +20,7 @@ from l2m_gtsam.maps.field_map import optional_members
 # The map's errors change over decimetres: it is not asked for them again while all readings are as
 # near to where it was, metres.
 REOBSERVE_M = 5e-3
+STAY = 0.5  # of the readings that lay inside the map: with fewer a sensor has left it
 
 
 class QueryableMap(Protocol):
@@ -187,6 +188,16 @@ def _view(readings: Readings, sample: FieldSample, sensors: int, min_readings: i
         inside=sample.inside,
         sensors=[int(s) for s in np.flatnonzero(usable)],
     )
+
+
+def inside_of_each(readings: Readings, view: View) -> IntArray:
+    """Return how many of all M readings lie inside the map, sensor by sensor, shape (S,)."""
+    return np.bincount(readings.sensor[view.inside], minlength=len(readings.sensors))
+
+
+def has_left(readings: Readings, view: View, begun: IntArray) -> BoolArray:
+    """Return which sensors have left the map since they had so many readings inside, shape (S,)."""
+    return np.asarray(inside_of_each(readings, view) < STAY * begun)
 
 
 def seen_from(view: View, field_map: QueryableMap, estimate: Estimate) -> View:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydantic import Field
-from scipy.linalg import qr, solve_triangular
+from scipy.linalg import null_space, qr, solve_triangular
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.options import Options
@@ -76,6 +76,19 @@ class Determinacy:
     borrowed: dict[str, str] = field(default_factory=dict)
     leaning: dict[str, str] = field(default_factory=dict)
     lent: int = 0
+
+    @property
+    def place_open(self) -> bool:
+        """Whether all of t takes part in what is not determined, as in a uniform field."""
+        return bool(self.touched[:3].all())
+
+    @property
+    def determined(self) -> FloatArray:
+        """Orthonormal rows that span what is determined, in useful sigmas, shape (15 - K, 15)."""
+        count = len(self.touched)
+        if not len(self.directions):
+            return np.eye(count)
+        return np.asarray(null_space(self.directions).T)
 
     @property
     def free(self) -> int:

@@ -150,7 +150,7 @@ class TimeModes:
             own = np.flatnonzero(drive == each)
             u = 1e-9 * (stamp[own] - self.first_ns[number]) / length
             values[own, number] = np.sqrt(2) * np.cos(np.pi * j * u[:, None])
-        return values.reshape(len(rows), -1)
+        return values.reshape(len(rows), len(self.drives) * self.count)
 
 
 def lasting(modes: TimeModes, seconds: float) -> FloatArray:
@@ -175,7 +175,7 @@ def pink_and_walk(modes: TimeModes) -> FloatArray:
 def times_modes(features: FloatArray, modes: FloatArray) -> FloatArray:
     """Return what weights of J modes, (n, J), of a quantities do, (n, 3, a): shape (n, 3, J a)."""
     product = np.einsum("nia,nj->nija", features, modes)
-    return np.asarray(product.reshape(len(features), 3, -1))
+    return np.asarray(product.reshape(len(features), 3, modes.shape[1] * features.shape[2]))
 
 
 @dataclass(frozen=True)

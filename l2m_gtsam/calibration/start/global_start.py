@@ -5,7 +5,7 @@ at once, on a map that costs nothing: the nearest reading of the survey. Its few
 followed to their minima on the map itself.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,12 +25,15 @@ from l2m_gtsam.records.calibration import FoundStart
 from l2m_gtsam.solve.profile import FieldPredictor, Snapshots, misfits, snapshots_of
 
 BATCH = 256  # candidates at a time
+ASKED = 24  # poses at which the map is asked whether it knows the field where a start is
 FIRST = 10  # poses that decide whether a candidate lies in the map at all
 STRIDE = 1.9  # steps of the grid: places nearer to a better one are not followed
 TINY = np.finfo(float).tiny
 
 Node = tuple[int, int, int, int]
 """A sensor, and a place in steps of the lattice."""
+InMap = Callable[[FloatArray], bool]
+"""Whether a sensor at a place, shape (3,), in metres, would read most of a drive inside the map."""
 
 
 class StartOptions(Options):
@@ -146,12 +149,17 @@ def starts_of(
     fine = fine_prediction(field_map, coarse)
     problem = StartProblem(snapshots, fine, field_map, options.step, 1 - options.outliers)
     followed = follow(problem, candidates, options.step, bounds)
+    few = snapshots.thinned(ASKED)
+
+    def in_map(t: FloatArray) -> bool:
+        return bool(field_map.query(few.places(t[None])[0]).inside.mean() >= options.least_known)
+
     sensors, starts = left.shape[-1], []
     for row in range(0, len(candidates), sensors):
         own = candidates[row : row + sensors]
-        found = [found_start(each, reached(each, followed), options) for each in own]
+        found = [found_start(each, reached(each, followed), options, in_map) for each in own]
         for group in groups:
-            place_group(group, problem, own, followed, options, found)
+            place_group(group, problem, own, followed, options, in_map, found)
         starts.append(found)
     return starts
 
@@ -189,10 +197,28 @@ def reached(candidates: "StartCandidates", followed: dict[Node, Basin]) -> list[
 
 
 def found_start(
-    candidates: "StartCandidates", reached: Sequence[Basin], options: StartOptions
+    candidates: "StartCandidates",
+    reached: Sequence[Basin],
+    options: StartOptions,
+    in_map: InMap,
 ) -> FoundStart | None:
-    """Return the best of the basins that a sensor's candidates led to, beside the second best."""
-    basins = distinct(reached, options.apart)
+    """Return the best of the basins that a sensor's candidates led to, beside the second best.
+
+    Where the field is much the same everywhere a descent may leave the map: there it explains
+    nothing.
+
+    Parameters
+    ----------
+    candidates, reached
+        Of the sensor.
+    options
+        How far apart basins are.
+    in_map
+        Whether a place is one of the map.
+    """
+    basins = list(distinct(reached, options.apart))
+    while basins and not in_map(basins[0].t):
+        del basins[0]
     if not basins:
         return None
     best, margin, runner_up = basins[0], candidates.margin, candidates.runner_up
@@ -207,6 +233,7 @@ def place_group(
     candidates: list["StartCandidates"],
     followed: dict[Node, Basin],
     options: StartOptions,
+    in_map: InMap,
     found: list[FoundStart | None],
 ) -> None:
     """Replace what was found for each sensor of a group by where the whole group fits best.
@@ -229,7 +256,8 @@ def place_group(
     ]
     mean = np.exp(np.mean(np.log(np.maximum(left, TINY)), axis=0))
     basins = [Basin(t, float(rms)) for t, rms in zip(places, mean, strict=True)]
-    start = found_start(candidates[group.sensors[0]], basins, options)
+    first = group.offset[0]
+    start = found_start(candidates[group.sensors[0]], basins, options, lambda t: in_map(t + first))
     for sensor, offset in zip(group.sensors, group.offset, strict=True):
         found[sensor] = None if start is None else start.moved(offset)
 

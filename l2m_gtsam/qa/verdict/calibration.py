@@ -19,6 +19,7 @@ from l2m_gtsam.qa.verdict.sensor import (
     misfit,
     precision,
     saturation,
+    unconverged,
 )
 from l2m_gtsam.qa.verdict.uncertainty import disturbance_reasons, stated_wrongly
 from l2m_gtsam.records.calibration import (
@@ -73,8 +74,14 @@ def judgement_of(result: CalibrationResult, metrics: Measures, options: QaOption
 
 def _on_sensor(case: Case) -> SensorVerdict:
     rules = RULES_OF_A_MISFIT if misfit(case) else RULES
-    reasons = (reason for rule in rules for reason in rule(case))
-    return SensorVerdict.of(case.sensor.sensor, reasons)
+    reasons = [reason for rule in rules for reason in rule(case)]
+    ended = unconverged(case)
+    if ended and all(each.level is not Level.FAIL for each in reasons):
+        causes = [reason for rule in CAUSES for reason in rule(case) if reason in reasons]
+        if cause := next((each for each in causes if each.level is Level.WARN), None):
+            reasons.remove(cause)
+            ended = [Reason(Level.FAIL, f"{cause.text} {each.text}") for each in ended]
+    return SensorVerdict.of(case.sensor.sensor, [*reasons, *ended])
 
 
 def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[Reason]:
@@ -124,7 +131,11 @@ def _exact(result: CalibrationResult) -> list[Reason]:
 
 def _wrong_map(cases: tuple[Case, ...]) -> list[Reason]:
     """Return that the map is the wrong one, if no sensor fits it."""
-    known = [case for case in cases if case.metrics and np.isfinite(case.sensor.t_sigma).all()]
+    known = [
+        case
+        for case in cases
+        if case.metrics and (np.isfinite(case.sensor.t_sigma).all() or misfit(case))
+    ]
     if not known or not all(map(misfit, known)):
         return []
     return [Reason(Level.FAIL, WRONG_MAP)]
@@ -218,6 +229,8 @@ RULES = (
     _lower_bounds,
 )
 RULES_OF_A_MISFIT = (saturation, fit, ending)
+# What may keep a solve from converging: named before that.
+CAUSES = (saturation, _own_stretches, repeat, fit)
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Level, Reason
 from l2m_gtsam.text.rounded import by_sigma, sigma_alone, significant
 
+OPEN_HEAD = "Not everything can be known"
 HEADS = {
-    SensorStatus.NOT_CONVERGED: "The solve did not converge",
     SensorStatus.NO_READINGS: "There is nothing to calibrate on",
     SensorStatus.OUTSIDE_MAP: "The map does not cover the drive",
     SensorStatus.DEAD_AXIS: "An axis is dead",
@@ -27,6 +27,7 @@ HEADS = {
     SensorStatus.CONTRADICTED: "What is known contradicts the readings",
     SensorStatus.FLIPPED_AXIS: "An axis is reversed",
 }
+WORSE = 1.5  # of what a uniform field leaves of the readings: the map contradicts them
 WRONG_MAP = (
     "The map does not fit this drive: a field that is the same everywhere explains the readings as "
     "well. Is it the map of this place, and are the poses in its frame?"
@@ -74,17 +75,26 @@ def beyond_range(limits: Sequence[SaturatedAxis], options: QaOptions) -> list[Re
     return options.saturated.reasons(share, f"{saturation_sentence(limits)}.")
 
 
-def ending(case: Case) -> list[Reason]:
-    """Return how the solve ended, where it did not end well."""
+def unconverged(case: Case) -> list[Reason]:
+    """Return that the solve did not converge, if it did not."""
     sensor = case.sensor
-    if sensor.status is SensorStatus.SOLVED:
+    if sensor.status is not SensorStatus.NOT_CONVERGED:
+        return []
+    head = OPEN_HEAD if sensor.undetermined else "The solve did not converge"
+    return [Reason(Level.FAIL, _sentence(head, sensor.message))]
+
+
+def ending(case: Case) -> list[Reason]:
+    """Return how the solve ended, where it did not end well; not if it did not converge."""
+    sensor = case.sensor
+    if sensor.status in (SensorStatus.SOLVED, SensorStatus.NOT_CONVERGED):
         return []
     if sensor.status is SensorStatus.UNDETERMINED:
         # Without a place or a rotation a sensor is useless; without an offset it is not.
         known = np.isfinite(np.diag(sensor.covariance)[:3]).all()
         turned = np.isfinite(np.diag(sensor.rotation_covariance)).all()
         level = Level.WARN if known and turned else Level.FAIL
-        return [Reason(level, _sentence("Not everything can be known", sensor.message))]
+        return [Reason(level, _sentence(OPEN_HEAD, sensor.message))]
     if sensor.status is SensorStatus.FLIPPED_AXIS and (swapped := _swapped_axes(case)):
         return [swapped]
     if sensor.status is SensorStatus.CONTRADICTED:
@@ -153,10 +163,12 @@ def misfit(case: Case) -> bool:
 
 
 def _explained(case: Case) -> list[Reason]:
-    # Where the place is open, the field is too uniform to test the map.
-    if case.metrics is None or not np.isfinite(case.sensor.t_sigma).all():
+    if case.metrics is None:
         return []
     found = case.metrics.fit
+    # Where the place is open, the field is too uniform to test the map, unless that is worse.
+    if not np.isfinite(case.sensor.t_sigma).all() and not found.unexplained > WORSE:
+        return []
     text = (
         f"The map leaves {significant(found.left, 2)} µT of its readings unexplained, a field that "
         f"is the same everywhere {significant(found.without_map, 2)} µT: "

@@ -238,7 +238,7 @@ def test_readings_that_are_all_wrong_are_no_map_of_another_place(
     series = (replace(recording.series[0], field=noise),)
     with pytest.raises(CalibrationError) as error:
         calibrate(replace(recording, series=series), world, OPTIONS)
-    assert "although the map covers the drive: mag_00: none of its" in str(error.value)
+    assert "no sensor can be solved: mag_00: none of its" in str(error.value)
 
 
 def test_a_given_start_is_not_looked_for(
