@@ -36,8 +36,7 @@ def saturated_axes(field: FloatArray) -> tuple[SaturatedAxis, ...]:
         Finite readings in order of time, shape (N, 3); at different places, for those of a vehicle
         at rest tie by themselves.
     """
-    same, distinct = np.asarray(field[1:] == field[:-1]), np.unique(field, axis=0)
-    found = []
+    distinct, found = np.unique(field, axis=0), list[SaturatedAxis]()
     for k, axis in enumerate("xyz"):
         values = np.unique(field[:, k])
         if len(values) <= FEWEST:
@@ -49,11 +48,10 @@ def saturated_axes(field: FloatArray) -> tuple[SaturatedAxis, ...]:
         for limit in (float(values[0]), float(values[-1])):
             away = np.abs(distinct[:, k] - limit)
             ties, around = int(np.sum(away == 0)), int(np.sum(away <= near))
-            by_chance = ties < FEWEST or _tail(ties, around, np.sqrt(step / near)) > CHANCE
-            at = field[:, k] == limit
-            if not by_chance and not _is_calm(same, at, k):
-                found.append(SaturatedAxis(axis, limit, int(np.sum(at)), len(field)))
-    return tuple(found)
+            if ties >= FEWEST and _tail(ties, around, np.sqrt(step / near)) <= CHANCE:
+                at = int(np.sum(field[:, k] == limit))
+                found.append(SaturatedAxis(axis, limit, at, len(field)))
+    return tuple(each for each in found if not _is_calm(field, each, found))
 
 
 def _step(values: FloatArray) -> float:
@@ -74,20 +72,25 @@ def _tail(ties: int, readings: int, share: float) -> float:
     return float(bdtrc(ties - 1, readings, share))
 
 
-def _is_calm(same: BoolArray, at: BoolArray, axis: int) -> bool:
+def _is_calm(field: FloatArray, limit: SaturatedAxis, all_: Sequence[SaturatedAxis]) -> bool:
     """Return whether readings repeat as a whole where an axis is at an extreme.
 
     Parameters
     ----------
-    same
-        Whether each axis repeats from a reading to the next, shape (N - 1, 3).
-    at
-        Which readings are at the extreme, shape (N,).
-    axis
-        Number of the axis.
+    field
+        Readings in order of time, shape (N, 3).
+    limit
+        The extreme.
+    all_
+        This and all others that may be limits: an axis at one of them says nothing.
     """
-    tied = same[:, axis] & at[1:]
-    return bool(tied.any() and same[tied].all(axis=1).mean() >= REPEATED)
+    same, at = field[1:] == field[:-1], np.zeros(field.shape, dtype=np.bool_)
+    for each in all_:
+        at[:, "xyz".index(each.axis)] |= field[:, "xyz".index(each.axis)] == each.limit
+    axis = "xyz".index(limit.axis)
+    tied = same[:, axis] & (field[1:, axis] == limit.limit) & ~at[1:].all(axis=1)
+    repeated = (same | at[1:])[tied].all(axis=1)
+    return bool(len(repeated) and repeated.mean() >= REPEATED)
 
 
 def is_saturated(field: FloatArray, limits: Iterable[SaturatedAxis]) -> BoolArray:

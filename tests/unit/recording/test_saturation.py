@@ -57,6 +57,14 @@ def test_a_clipped_axis_is_found_with_its_limit_and_its_share(seed: int, share: 
     )
 
 
+@given(SEEDS, st.floats(0.1, 0.4))
+def test_axes_that_are_clipped_together_are_all_found(seed: int, share: float) -> None:
+    field = level_rounds(seed, 0.1, 20.0)
+    low, high = np.quantile(field, [share, 1 - share], axis=0)
+    found = saturated_axes(np.clip(field, low, high))
+    assert [each.axis for each in found] == ["x", "x", "y", "y", "z", "z"]
+
+
 @given(SEEDS, st.sampled_from([0.05, 0.1]))
 def test_so_is_one_whose_digits_are_coarse_where_the_field_varies(seed: int, step: float) -> None:
     field = in_steps(level_rounds(seed, 0.1, 20.0), step)
