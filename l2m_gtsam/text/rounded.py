@@ -1,11 +1,12 @@
 """Numbers as a person reads them: as many digits as their standard deviation leaves.
 
 A standard deviation has two significant digits, its value ends at the same decimal, and zeros at
-the end stay. Exponents are for what is below 1e-5 or above 1e7 only.
+the end stay. Entries of a vector end at one decimal, that of the smallest. Exponents are for what
+is below 1e-5 or above 1e7 only.
 """
 
 from collections.abc import Iterable
-from math import isfinite
+from math import inf, isfinite
 
 OF_SIGMA = 2  # significant digits of a standard deviation
 LEAST, MOST = -5, 7  # decades between which no number has an exponent
@@ -65,14 +66,39 @@ def in_unit(number: str, unit: str) -> str:
     return f"{number}{'' if unit in ('', '°', '%') else ' '}{unit}"
 
 
+def entries_by_sigma(values: Iterable[float], sigmas: Iterable[float]) -> list[str]:
+    """Return the entries of a vector, all ending where the smallest standard deviation does."""
+    own = list(sigmas)
+    least = _least(own)
+    return [by_sigma(v, least if _counts(s) else s) for v, s in zip(values, own, strict=True)]
+
+
+def sigma_entries(sigmas: Iterable[float]) -> list[str]:
+    """Return standard deviations of a vector's entries; a dash for each that is infinite."""
+    own = list(sigmas)
+    places = _places(_least(own))
+    return [
+        sigma_alone(s) if places is None or not _counts(s) else _ending_at(s, places) for s in own
+    ]
+
+
 def vector_by_sigma(values: Iterable[float], sigmas: Iterable[float]) -> str:
-    """Return a vector in brackets, each entry by its standard deviation."""
-    return f"({', '.join(map(by_sigma, values, sigmas))})"
+    """Return a vector in brackets, its entries as ``entries_by_sigma`` has them."""
+    return f"({', '.join(entries_by_sigma(values, sigmas))})"
 
 
 def vector_of_sigmas(sigmas: Iterable[float]) -> str:
     """Return standard deviations in brackets; a dash for each that is infinite."""
-    return f"({', '.join(map(sigma_alone, sigmas))})"
+    return f"({', '.join(sigma_entries(sigmas))})"
+
+
+def _counts(sigma: float) -> bool:
+    return isfinite(sigma) and sigma > 0
+
+
+def _least(sigmas: Iterable[float]) -> float:
+    """Return the smallest standard deviation that counts; infinite without one."""
+    return min(filter(_counts, sigmas), default=inf)
 
 
 def _decade(value: float, digits: int) -> int:

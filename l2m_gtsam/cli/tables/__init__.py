@@ -1,13 +1,13 @@
 """Results as tables and lines in the terminal."""
 
 from collections.abc import Sequence
-from math import isfinite
 
+import numpy as np
 from rich import box
 from rich.table import Table
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.text.rounded import by_sigma, sigma_alone
+from l2m_gtsam.text.rounded import entries_by_sigma, sigma_entries
 
 TEXT_WIDTH = 18  # the least of a column of text that breaks where it must
 OPEN = "-"  # what is not determined
@@ -51,15 +51,18 @@ def add_text(table: Table, heading: str, width: int = TEXT_WIDTH) -> None:
 
 
 def vector_cell(values: FloatArray, sigmas: FloatArray, width: int = 0) -> str:
-    """Return a vector, each entry by its standard deviation; a dash for what is not determined."""
-    pairs = zip(values.tolist(), sigmas.tolist(), strict=True)
-    each = (by_sigma(v, s) if isfinite(v) and isfinite(s) else OPEN for v, s in pairs)
+    """Return a vector by its standard deviations; a dash for what is not determined."""
+    known = np.isfinite(values) & np.isfinite(sigmas)
+    texts = entries_by_sigma(values.tolist(), sigmas.tolist())
+    each = (text if is_known else OPEN for text, is_known in zip(texts, known, strict=True))
     return " ".join(f"{text:>{width}}" for text in each)
 
 
 def sigmas_cell(sigmas: FloatArray) -> str:
     """Return standard deviations; a dash for what is not determined."""
-    return " ".join(sigma_alone(each) if isfinite(each) else OPEN for each in sigmas.tolist())
+    texts = sigma_entries(sigmas.tolist())
+    known = np.isfinite(sigmas)
+    return " ".join(text if is_known else OPEN for text, is_known in zip(texts, known, strict=True))
 
 
 def coloured(level: str) -> str:

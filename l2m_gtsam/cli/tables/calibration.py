@@ -4,8 +4,8 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.cli.tables import add_numbers, new_table, plain_table, sigmas_cell, vector_cell
-from l2m_gtsam.data import KnownSensor
+from l2m_gtsam.cli.tables import OPEN, add_numbers, new_table, plain_table, sigmas_cell, vector_cell
+from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.qa.verdict.places import stretch_head
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
@@ -31,7 +31,8 @@ HEADINGS = (
     "outside map",
     "|C - R| max",
 )
-WIDTH = 7  # of a coordinate: rows are below each other
+WIDTH = 8  # of a coordinate: rows are below each other
+METRES, MILLIMETRES = "7.4f", "5.1f"  # of a table of errors, row by row alike
 MODEL_HEADINGS = (
     "score",
     "behind the best",
@@ -152,21 +153,25 @@ def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Ta
 
 
 def _truth_row(known: KnownSensor, sensor: SensorCalibration) -> tuple[str, ...]:
-    name = escape(known.sensor)
+    name, true = escape(known.sensor), _in_places(known.t_lidar_mag, METRES)
     if sensor.residuals is None:
-        true = " ".join(f"{each:.3f}" for each in known.t_lidar_mag)
         return (name, _status(sensor), *("-",) * 5, true, "-")
     C_error = np.linalg.norm(sensor.distortion.C - known.distortion.C)
     H_error = np.linalg.norm(sensor.distortion.H - known.distortion.H)
     return (
         name,
-        vector_cell(1e3 * (sensor.t_lidar_mag - known.t_lidar_mag), 1e3 * sensor.t_sigma),
-        sigmas_cell(1e3 * sensor.t_sigma),
+        _in_places(1e3 * (sensor.t_lidar_mag - known.t_lidar_mag), MILLIMETRES),
+        _in_places(1e3 * sensor.t_sigma, MILLIMETRES),
         *_length(H_error, np.linalg.norm(sensor.H_sigma)),
         *_length(C_error, np.linalg.norm(sensor.C_sigma)),
-        vector_cell(known.t_lidar_mag, sensor.t_sigma),
-        vector_cell(sensor.t_lidar_mag, sensor.t_sigma),
+        true,
+        _in_places(sensor.t_lidar_mag, METRES),
     )
+
+
+def _in_places(values: FloatArray, form: str) -> str:
+    """Return a vector whose rows are below each other; a dash for what is not determined."""
+    return " ".join(format(each, form) if np.isfinite(each) else OPEN for each in values.tolist())
 
 
 def _length(error: np.floating, sigma: np.floating) -> tuple[str, str]:

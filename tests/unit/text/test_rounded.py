@@ -40,7 +40,7 @@ def test_units_and_signs_are_kept() -> None:
     assert with_sigma(6.8, 0.25, "°", signed=True) == "+6.80 ± 0.25°"
     assert with_sigma(-43.2, 11.3, "A m²", signed=True) == "-43 ± 11 A m²"
     assert with_sigma(1.0, inf, "mm") == "not determined"
-    assert vector_by_sigma((1.0, -2.0, 3.0), (0.1, 0.02, inf)) == "(1.00, -2.000, not determined)"
+    assert vector_by_sigma((1.0, -2.0, 3.0), (0.1, 0.02, inf)) == "(1.000, -2.000, not determined)"
 
 
 @pytest.mark.parametrize(
