@@ -65,9 +65,9 @@ def test_the_page_links_to_reports_that_are_there(fleet_run: FleetRun) -> None:
 NUMBER = re.compile(r"(?<![\w#])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
 
 
-# A report's number is a hash of its results to the last digit, and that of a clipped or a repeated
-# part of a picture one of its coordinates.
-HASH = re.compile(r"\b[Cmp]?[0-9a-f]{10}\b")
+# A report's id, whole or its first digits, is a hash of its results to the last digit, and the name
+# of a clipped or a repeated part of a picture one of its coordinates.
+HASH = re.compile(r"\b(?:[0-9a-f]{64}|[0-9a-f]{16}|[Cmp]?[0-9a-f]{10})\b")
 
 
 def without_numbers(path: Path) -> str:
@@ -97,7 +97,8 @@ def test_a_drive_has_what_calibrate_writes(fleet_run: FleetRun, tmp_path: Path) 
         # t differs by 1e-11 m on some machines. Pictures in pages have coordinates of a few digits.
         if ours.suffix != ".html":
             found, wanted = (
-                np.array(NUMBER.findall(each.read_text()), dtype=np.float64) for each in (ours, own)
+                np.array(NUMBER.findall(HASH.sub("#", each.read_text())), dtype=np.float64)
+                for each in (ours, own)
             )
             np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-8)
 

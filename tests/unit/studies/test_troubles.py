@@ -5,8 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import Distortion, KnownSensor, Trajectory
+from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.troubles.cells import Checked, JudgedSensor, TroublesCell
 from l2m_gtsam.studies.troubles.drives import (
@@ -71,16 +72,25 @@ def test_of_a_scale_that_is_not_linear_the_nearest_linear_one_is_true() -> None:
     assert np.square(left).sum() < 0.5 * np.square(change).sum()
 
 
-def test_a_bent_frame_moves_places_and_turns_nothing() -> None:
-    at = np.linspace(0, 50, 200)
-    R = np.broadcast_to(np.eye(3), (200, 3, 3))
+def test_a_bent_frame_moves_places_and_turns_them_by_half_its_curl() -> None:
+    """By central differences of the shifts."""
+    at, h = np.linspace(0, 50, 200), 1e-6
     p = np.column_stack([5 * np.cos(at), 3 * np.sin(at), 0 * at])
-    true = Trajectory((1e9 * at).astype(np.int64), R, p, "map", "lidar")
-    moved = bent(true, OPTIONS, np.random.default_rng(2))
-    np.testing.assert_array_equal(moved.R, true.R)
-    shift = moved.p - true.p
+    R = np.broadcast_to(np.eye(3), (200, 3, 3))
+
+    def shifted(by: FloatArray) -> Trajectory:
+        true = Trajectory((1e9 * at).astype(np.int64), R, p + by, "map", "lidar")
+        return bent(true, OPTIONS, np.random.default_rng(2))
+
+    moved = shifted(np.zeros(3))
+    shift = moved.p - p
     assert not shift[:, 2].any()
     assert 0 < np.abs(shift).max() <= OPTIONS.warp_m
+    dx, dy = ((shifted(h * e).p - shifted(-h * e).p) / (2 * h) for e in np.eye(3)[:2])
+    turn = Rotation.from_matrix(moved.R).as_rotvec()
+    np.testing.assert_allclose(turn[:, 2], 0.5 * (dx[:, 1] - dy[:, 0]), atol=1e-8)
+    np.testing.assert_array_equal(turn[:, :2], 0)
+    assert 0 < np.abs(turn).max() < np.deg2rad(1)
 
 
 @pytest.mark.parametrize("world", list(World))
