@@ -8,6 +8,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import (
+    ARRAYS,
     Distortion,
     FieldSeries,
     FloatArray,
@@ -21,7 +22,6 @@ from l2m_gtsam.errors import InputError, UnitsError
 from l2m_gtsam.storage.units import Unit, Units, field_fault, microtesla_per
 
 LATEST_S = 9e9
-ARRAYS = "(arrays)"
 
 
 def drive(

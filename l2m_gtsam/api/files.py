@@ -11,6 +11,7 @@ from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.config import Config, with_poses
 from l2m_gtsam.data import KnownSensor, Recording
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.frames import frame_of
 from l2m_gtsam.progress import silent
 from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.records.calibration import CalibrationResult
@@ -74,7 +75,7 @@ def load_map(path: str | Path) -> FieldMap:
     return SavedMap.read(Path(path)).open(silent)
 
 
-def save_map(path: str | Path, field_map: FieldMap, *, frame: str = "map") -> None:
+def save_map(path: str | Path, field_map: FieldMap, *, frame: str | None = None) -> None:
     """Write a map to a file (`.npz`) that the commands read.
 
     Parameters
@@ -84,14 +85,15 @@ def save_map(path: str | Path, field_map: FieldMap, *, frame: str = "map") -> No
     field_map
         The map.
     frame
-        Name of the frame that it is in.
+        Name of the frame that it is in; that of its survey's poses if absent.
 
     Raises
     ------
     OutputError
         The file cannot be written.
     """
-    provenance = {"frame": frame, "version": version("l2m-gtsam")}
+    named = frame or frame_of(field_map) or "map"
+    provenance = {"frame": named, "version": version("l2m-gtsam")}
     write_map(Path(path), field_map, provenance, None)
 
 

@@ -12,6 +12,7 @@ from l2m_gtsam.data import MapState, Recording, ScalarSeries, SourceFile
 from l2m_gtsam.errors import BagError, CalibrationError, MapError, OutputError
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap, Remembering
+from l2m_gtsam.maps.frames import refuse_other_frame
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.options import Options, first_fault
 from l2m_gtsam.progress import Count, Progress, counter
@@ -193,13 +194,7 @@ class SavedMap:
 
     def check_frame(self, drive: Recording) -> None:
         """Raise a MapError for a drive that is said to be in another frame."""
-        frame = self.state.provenance.get("frame")
-        if frame not in (None, drive.trajectory.frame):
-            raise MapError(
-                f"{self.path} is in frame {frame!r}, the poses of {drive.source.path} are in "
-                f"{drive.trajectory.frame!r}; if both mean the same, say so with "
-                f"`bag.frame: {frame}`"
-            )
+        refuse_other_frame(self.state.provenance.get("frame"), drive, str(self.path))
 
     def _list_of(self, name: str) -> list[Any]:
         entries = self.state.provenance.get(name)

@@ -182,9 +182,7 @@ def _begun(
 
 
 def _opened(saved: SavedMap, recording: Recording, config: Config, progress: Progress) -> FieldMap:
-    start = config.slam.start
-    is_given = start.position is not None and start.quaternion_xyzw is not None
-    return saved.open(progress, [] if start.anywhere or is_given else [recording])
+    return saved.open(progress, [recording] if config.slam.start.by_odometry else [])
 
 
 def _matcher_or_why_not(

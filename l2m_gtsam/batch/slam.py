@@ -275,10 +275,8 @@ def _localised(
     config: Config,
     progress: Progress,
 ) -> _Found:
-    start = config.slam.start
     # A start that is given, or found, puts odometry of any frame into the map.
-    is_given = start.position is not None and start.quaternion_xyzw is not None
-    field_map = saved.open(progress, [] if start.anywhere or is_given else [recording])
+    field_map = saved.open(progress, [recording] if config.slam.start.by_odometry else [])
     found = localise(recording, field_map, calibration, config.slam, progress, evidence)
     if found.result.status in NOWHERE:
         reasons = "; ".join((found.result.message, *found.result.notes))

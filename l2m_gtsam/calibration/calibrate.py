@@ -23,6 +23,7 @@ from l2m_gtsam.calibration.view import Compilable, QueryableMap, RememberedMap
 from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.maps.frames import check_frame
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.drive_trace import trace_of
@@ -89,6 +90,8 @@ def calibrate(
 
     Raises
     ------
+    MapError
+        The poses are in another frame than the map.
     SyncError
         Readings and poses do not overlap.
     CalibrationError
@@ -107,6 +110,7 @@ def calibrated(
     progress: Progress = silent,
 ) -> Calibrated:
     """Calibrate as ``calibrate`` does, and keep what the result rests on, to judge it by."""
+    check_frame(field_map, recording, map_source.path if map_source else "the map")
     synchronised = prepare(recording, options)
     alive = synchronised.readings.select(~stuck_readings(synchronised.readings))
     compiled = field_map.compile() if isinstance(field_map, Compilable) else field_map

@@ -14,6 +14,7 @@ from l2m_gtsam.mapping.suite_calibration import steady_survey, suite_doubts
 from l2m_gtsam.maps.build import KINDS, build_map
 from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.frames import check_frame, framed
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.reading_errors import errors_together
 from l2m_gtsam.maps.suite_errors import SuiteErrors
@@ -92,6 +93,7 @@ def map_recordings(
     recordings = steady.recordings
     read = suite_readings(recordings, suite, options.sync, options.pose_noise)
     field_map = build_map(read.points, read.field, options.model, cloud, read.suite, read.poses)
+    field_map = framed(field_map, recordings[0].trajectory.frame)
     if isinstance(field_map, HarmonicMap):
         field_map = field_map.doubted((*steady.doubts, *read.doubts))
     # Errors that are stated or found are counted; sensors that count as exact have to look like it.
@@ -123,6 +125,8 @@ def update_map(
     MapError, SyncError
         As in ``map_recordings``.
     """
+    for each in recordings:
+        check_frame(field_map, each)
     steady = steady_survey(recordings, suite, options.suite)
     read = suite_readings(steady.recordings, suite, options.sync, options.pose_noise)
     if isinstance(field_map, HarmonicMap):

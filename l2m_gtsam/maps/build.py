@@ -11,6 +11,7 @@ from l2m_gtsam.maps.bilinear.bilinear_map import BilinearMap
 from l2m_gtsam.maps.bilinear.cells import BilinearOptions
 from l2m_gtsam.maps.dense_gp import DenseGP, DenseGPOptions
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.frames import framed
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
@@ -151,4 +152,4 @@ def map_from_state(state: MapState) -> FieldMap:
     """
     if state.kind not in KINDS:
         raise MapError(f"map kind {state.kind!r} is not known; {', '.join(KINDS)} are")
-    return KINDS[state.kind].load(state)
+    return framed(KINDS[state.kind].load(state), state.provenance.get("frame"))

@@ -100,7 +100,7 @@ class SlidingGP(GPMap[SlidingGPOptions]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Factors of all blocks are hundreds of times as large as what they follow from.
-        return SlidingGP.condition, (self.trained, self.options)
+        return _conditioned, (self.trained, self.options, self.frame)
 
     @cached_property
     def sums(self) -> KernelSums:
@@ -181,3 +181,8 @@ def posteriors(trained: Trained, members: list[IntArray]) -> Iterator[Posterior]
         posterior = condition(trained.readings[rows], mean, trained.hyperparameters)
         used += 8 * len(posterior.whitener.entries) if posterior.whitener else 0
         yield posterior if used <= FACTOR_MEMORY else posterior.without_whitener()
+
+
+def _conditioned(trained: Trained, options: SlidingGPOptions, frame: str | None) -> SlidingGP:
+    """Return a map that was taken apart to be sent."""
+    return SlidingGP.condition(trained, options).in_frame(frame)

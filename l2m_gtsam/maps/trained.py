@@ -1,7 +1,7 @@
 """What every Gaussian-process map is made of: training readings and hyperparameters."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
@@ -99,6 +99,8 @@ class GPMap(ABC, Generic[AnyGPOptions]):
         Effective options.
     mean
         Prior mean in uT, shape (3,).
+    frame
+        Name of the map frame; None where it is not known.
     """
 
     kind: ClassVar[str]
@@ -106,6 +108,8 @@ class GPMap(ABC, Generic[AnyGPOptions]):
     trained: Trained
     options: AnyGPOptions
     mean: FloatArray
+    _: KW_ONLY
+    frame: str | None = None
 
     @classmethod
     def fit(
@@ -176,7 +180,12 @@ class GPMap(ABC, Generic[AnyGPOptions]):
 
     def updated(self, points: FloatArray, field: FloatArray, /) -> Self:
         """Return the map with more readings and the same hyperparameters; see ``FieldMap``."""
-        return self.condition(extended(self.trained, points, field, self.options), self.options)
+        known = extended(self.trained, points, field, self.options)
+        return self.condition(known, self.options).in_frame(self.frame)
+
+    def in_frame(self, frame: str | None, /) -> Self:
+        """Return the map with another name of its frame."""
+        return replace(self, frame=frame)
 
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""

@@ -27,6 +27,7 @@ from l2m_gtsam.data import (
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.geometry import polar_rotation
 from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.maps.frames import check_frame
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.planning.motion import (
     ExtraMotion,
@@ -113,11 +114,14 @@ def plan(
 
     Raises
     ------
+    MapError
+        The poses are in another frame than the map.
     SyncError
         Readings and poses do not overlap.
     CalibrationError
         The map does not cover the drive, or a place is given for an unknown sensor.
     """
+    check_frame(field_map, recording)
     synchronised = prepare(recording, options)
     readings = synchronised.readings
     solver_map = for_solvers(field_map)

@@ -9,6 +9,7 @@ from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import FloatArray, Readings, Recording, RigidTransform, Trajectory
 from l2m_gtsam.errors import CalibrationError, ConfigError, SyncError
 from l2m_gtsam.geometry import isotropic_covariance
+from l2m_gtsam.maps.frames import check_frame
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.dropouts import is_dead, mask_dropouts
@@ -85,7 +86,8 @@ def localise(
     SyncError
         Readings and poses do not overlap, or there are fewer than two poses.
     MapError
-        The start was searched for, and several places of the map fit or none.
+        The start was searched for, and several places of the map fit or none. Or it is that of
+        odometry, which is in another frame than the map.
     ConfigError
         Odometry is to know its steps along fixed axes, in a map.
     """
@@ -93,6 +95,8 @@ def localise(
         raise ConfigError(
             "`slam.drift.axes: fixed` works without a map: leave out --map, or give `vehicle`"
         )
+    if options.start.by_odometry:
+        check_frame(field_map, recording)
     drive, notes = prepared(recording, calibration, options, evidence)
     solver_map = for_solvers(field_map)
     search = None

@@ -219,6 +219,12 @@ class StartPoseOptions(Options):
     search: StartSearchOptions = StartSearchOptions()
     """How, with `anywhere`."""
 
+    @property
+    def by_odometry(self) -> bool:
+        """Whether the first recorded pose puts odometry into the map: both are in one frame."""
+        is_given = self.position is not None and self.quaternion_xyzw is not None
+        return not (self.anywhere or is_given)
+
     @model_validator(mode="after")
     def _known_or_not(self) -> "StartPoseOptions":
         if self.anywhere and (self.position is not None or self.quaternion_xyzw is not None):

@@ -17,6 +17,7 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import SurveyReadings, suite_readings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.frames import check_frame
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.renewal import DriveReadings, renewed
 from l2m_gtsam.maps.training import additional_set
@@ -128,8 +129,8 @@ def kept_up(
     Raises
     ------
     MapError
-        The kind of map keeps no steel, a drive has no date or is earlier than the map, or its
-        sensors are not as they are calibrated.
+        The kind of map keeps no steel, a drive is in another frame, has no date or is earlier than
+        the map, or its sensors are not as they are calibrated.
     SyncError
         Readings and poses of a recording do not overlap.
     """
@@ -138,6 +139,8 @@ def kept_up(
             f"a map of kind {field_map.kind} keeps no readings of its survey; --changes needs one "
             "of kind harmonic"
         )
+    for each in recordings:
+        check_frame(field_map, each)
     drives = [(dated(each), each) for each in recordings]
     for drive, recording in sorted(drives, key=lambda each: str(each[0].begun)):
         field_map = after_drive(field_map, recording, drive, suite, options, changes, survey)

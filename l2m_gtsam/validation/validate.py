@@ -18,6 +18,7 @@ from l2m_gtsam.data import (
     same_content,
 )
 from l2m_gtsam.errors import CalibrationError, ConfigError
+from l2m_gtsam.maps.frames import check_frame
 from l2m_gtsam.maps.sources.changed_map import ChangedMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
@@ -86,9 +87,12 @@ def validate(
         Calibration and recording have no sensor in common, or it was computed from this drive.
     ConfigError
         Readings follow a number that was not recorded.
+    MapError
+        The poses are in another frame than the map.
     SyncError
         Readings and poses do not overlap.
     """
+    check_frame(field_map, recording, map_source.path if map_source else "the map")
     if is_own_drive(recording, calibration):
         raise CalibrationError(
             f"{recording.source.path}: is the drive that the calibration was computed from, or a "

@@ -12,7 +12,7 @@ about the interpolant: noise of the readings and what the grid is too coarse for
 how far the data are, and too little where a cell holds a single reading.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -52,6 +52,8 @@ class BilinearMap:
         Field at the nodes in uT, map frame.
     spread
         Mean square of the readings about the interpolant per axis in square microtesla.
+    frame
+        Name of the map frame; None where it is not known.
     """
 
     kind: ClassVar[str] = "bilinear"
@@ -59,6 +61,7 @@ class BilinearMap:
     options: BilinearOptions
     lattice: Lattice
     spread: float
+    frame: str | None = None
 
     @classmethod
     def fit(
@@ -158,7 +161,11 @@ class BilinearMap:
         squares += squares_about(lattice, old) - squares_about(self.lattice, old)
         squares = max(squares, 0.0) + squares_about(lattice, new)
         spread = squares / (3 * float(cells.count.sum()))
-        return BilinearMap(cells, self.options, lattice, spread)
+        return BilinearMap(cells, self.options, lattice, spread, self.frame)
+
+    def in_frame(self, frame: str | None, /) -> "BilinearMap":
+        """Return the map with another name of its frame."""
+        return replace(self, frame=frame)
 
     def to_state(self) -> MapState:
         """Return the map as its averages: the nodes are filled again from them."""

@@ -1,8 +1,8 @@
 """A map of harmonic potentials: tiles of floor and ceiling modes, uniform field and sources."""
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -71,12 +71,16 @@ class HarmonicMap:
         Options of the map, lengths in metres.
     tiles
         One for each cell of the tiling, solved when first needed.
+    frame
+        Name of the map frame; None where it is not known.
     """
 
     kind: ClassVar[str] = "harmonic"
     learnt: Learnt
     options: HarmonicOptions
     tiles: Tiles
+    _: KW_ONLY
+    frame: str | None = None
 
     @classmethod
     def fit(
@@ -186,7 +190,7 @@ class HarmonicMap:
             for index, cell in enumerate(learnt.tiling.grid.cells.tolist())
             if not touched[index] and old.get(tuple(cell)) in solved
         }
-        return HarmonicMap(learnt, self.options, Tiles(learnt, kept))
+        return HarmonicMap(learnt, self.options, Tiles(learnt, kept), frame=self.frame)
 
     @classmethod
     def from_state(cls, state: MapState) -> "HarmonicMap":
@@ -205,6 +209,10 @@ class HarmonicMap:
         origin = self.learnt.origin
         learnt = replace(self.learnt, origin=replace(origin, survey=(*origin.survey, *doubts)))
         return replace(self, learnt=learnt)
+
+    def in_frame(self, frame: str | None, /) -> Self:
+        """Return the map with another name of its frame."""
+        return replace(self, frame=frame)
 
     def with_store(self, store: TileStore) -> "HarmonicMap":
         """Return the map that keeps its tiles in a store, and takes from it those that it has."""
@@ -280,7 +288,8 @@ class HarmonicMap:
 
         Whoever asks again shares the tiles that are compiled already.
         """
-        return CompiledMap(self.learnt, self.options, self.tiles, self._compiled)
+        whole = self.learnt, self.options, self.tiles
+        return CompiledMap(*whole, self._compiled, frame=self.frame)
 
     @cached_property
     def _compiled(self) -> CompiledTiles:

@@ -74,7 +74,8 @@ def renewed(
     learnt = learnt.followed_by(new.readings, options, new.suite, new.drive)
     learnt = with_places(corrected(learnt, changes, len(before.readings)), changes)
     learnt = told(with_steps(learnt, new.readings.points), changes)
-    return HarmonicMap.condition(explained(without_outdated(learnt, options), options), options)
+    known = explained(without_outdated(learnt, options), options)
+    return HarmonicMap.condition(known, options).in_frame(field_map.frame)
 
 
 def corrected(learnt: Learnt, changes: Sequence[DatedChange], count: int) -> Learnt:
