@@ -75,7 +75,7 @@ def load_options(path: Path, model: type[Model]) -> Model:
     try:
         return model.model_validate({} if content is None else content)
     except ValidationError as error:
-        raise ConfigError(_explain(path, error, model)) from error
+        raise ConfigError(f"{path}: {fault_in(model, error)}") from error
 
 
 def with_uncertainty(config: Config, name: str | None) -> Config:
@@ -130,15 +130,26 @@ def with_poses(
     return config.model_copy(update={"bag": bag})
 
 
-def _explain(path: Path, error: ValidationError, model: type[BaseModel]) -> str:
-    """Return one line about the first fault."""
+def fault_in(model: type[BaseModel], error: ValidationError, *above: str) -> str:
+    """Return one line about the first fault of options.
+
+    Parameters
+    ----------
+    model
+        Their kind.
+    error
+        What pydantic raises.
+    above
+        Keys above theirs.
+    """
     fault = named_fault(error)
-    key = shown(".".join(str(part) for part in fault["loc"]), LONGEST_KEY) or "the file"
+    parts = (*above, *map(str, fault["loc"]))
+    key = shown(".".join(parts), LONGEST_KEY) or "the file"
     if fault["type"] == "extra_forbidden":
         accepted = ", ".join(_accepted(model, fault["loc"][:-1]))
-        return f"{path}: unknown key {key!r}; accepted here: {accepted}"
+        return f"unknown key {key!r}; accepted here: {accepted}"
     why = shown(words_of(fault), LONGEST_REASON)
-    return f"{path}: {key}: {why}, got {shown_value(fault['input'])}"
+    return f"{key}: {why}, got {shown_value(fault['input'])}"
 
 
 def _accepted(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

@@ -4,6 +4,8 @@ Every message names the offender (file, topic, sensor or key) and says what woul
 The command line prints it as one line and exits with code 2.
 """
 
+from collections.abc import Iterable
+
 
 class L2MError(Exception):
     """Base of all errors that a user can mend."""
@@ -19,6 +21,17 @@ class UnitsError(L2MError):
 
 class InputError(L2MError):
     """An array or an argument that is not what it should be."""
+
+
+class NoSuchNameError(InputError, KeyError):
+    """A name that is not there, where what is there is asked by name, as in a dict."""
+
+    __str__ = Exception.__str__  # that of a KeyError puts the line in quotes
+
+    @classmethod
+    def of(cls, name: object, there: Iterable[str]) -> "NoSuchNameError":
+        """Return the error of a name beside the names that are there."""
+        return cls(f"no sensor named {name!r}; there are {', '.join(there) or 'none'}")
 
 
 class SyncError(L2MError):

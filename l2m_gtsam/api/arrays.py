@@ -2,11 +2,13 @@
 
 import hashlib
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from l2m_gtsam.api.arguments import NAME, came, check, pair_of, refused
 from l2m_gtsam.data import (
     ARRAYS,
     Distortion,
@@ -56,7 +58,8 @@ def drive(
         Name of the frame of the poses, the same for survey and drive.
     pose_covariance
         Of the errors of the poses, shape (6, 6) or (N, 6, 6): a rotation in radians, then a
-        translation in metres, along the axes of the LiDAR. Poses count as exact without.
+        translation in metres, along the axes of the LiDAR. Unknown if absent, or if that of a pose
+        is all zero.
 
     Raises
     ------
@@ -70,10 +73,8 @@ def drive(
     R = _rotations(orientations, len(times))
     if len(times) < 2 or (np.diff(times) <= 0).any():
         raise InputError("stamps: two or more, each later than the one before, are needed")
-    if not fields:
-        raise InputError("fields: no magnetometer is given; accepted: {name: (stamps, readings)}")
     named = _units(units)
-    series = tuple(_series(name, *fields[name], named) for name in sorted(fields))
+    series = _all_series(fields, named)
     digest = hashlib.sha256()
     for array in (times, p, R, *(a for each in series for a in (each.stamp_ns, each.field))):
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -110,11 +111,22 @@ def known_sensor(
     InputError
         An array has another shape, is not finite, or C cannot be inverted.
     """
+    check(NAME, name=name)
     matrix = _finite("C", np.eye(3) if C is None else C, (3, 3))
     if np.linalg.cond(matrix) > 1e6:
         raise InputError("C: cannot be inverted, so that readings say nothing of the field")
     distortion = Distortion(matrix, _finite("H", H, (3,)))
-    return KnownSensor(name, _finite("t", t, (3,)), distortion, time_offset)
+    late = float(_finite("time_offset", time_offset, ()))
+    return KnownSensor(name, _finite("t", t, (3,)), distortion, late)
+
+
+def _all_series(fields: Mapping[str, Any], units: Units) -> tuple[FieldSeries, ...]:
+    if not isinstance(fields, Mapping) or not fields:
+        raise refused("fields", fields, "{name: (stamps, readings)} of each magnetometer")
+    for name in fields:
+        check(NAME, **{"fields: a name": name})
+    pairs = {name: pair_of(f"fields[{name!r}]", fields[name]) for name in sorted(fields)}
+    return tuple(_series(name, *pair, units) for name, pair in pairs.items())
 
 
 def _series(name: str, stamps: npt.ArrayLike, readings: npt.ArrayLike, units: Units) -> FieldSeries:
@@ -148,7 +160,10 @@ def _units(units: str | float) -> Units:
 
 def _stamps(name: str, values: npt.ArrayLike) -> IntArray:
     """Return times in nanoseconds."""
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError as error:  # lists of other lengths in a list
+        raise refused(name, values, "an array of numbers of shape (N,)") from error
     if array.ndim != 1 or array.dtype.kind not in "iuf":
         raise InputError(
             f"{name}: {array.dtype} of shape {array.shape}; needed are numbers of shape (N,)"
@@ -163,10 +178,7 @@ def _stamps(name: str, values: npt.ArrayLike) -> IntArray:
 def _numbers(
     name: str, values: npt.ArrayLike, shape: tuple[int, ...], *, finite: bool = True
 ) -> FloatArray:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: not an array of numbers") from error
+    array = array_of(name, values)
     if array.shape != shape:
         raise InputError(f"{name}: of shape {array.shape}; needed is {shape}")
     if finite and not np.isfinite(array).all():
@@ -174,11 +186,22 @@ def _numbers(
     return array
 
 
-def _covariance(values: npt.ArrayLike, count: int) -> FloatArray:
-    array = np.asarray(values, dtype=np.float64)
+def array_of(name: str, values: npt.ArrayLike) -> FloatArray:
+    """Return an array of numbers; an InputError for what is none."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: not an array of numbers ({came(values)})") from error
+
+
+def _covariance(values: npt.ArrayLike, count: int) -> FloatArray | None:
+    """Return covariances of poses, shape (N, 6, 6); None where one is all zero, as in messages."""
+    array = array_of("pose_covariance", values)
     each = np.broadcast_to(array, (count, 6, 6)) if array.shape == (6, 6) else array
     found = _numbers("pose_covariance", each, (count, 6, 6))
     largest = np.abs(found).max(axis=(1, 2), keepdims=True)
+    if not largest.all():
+        return None
     symmetric = np.abs(found - found.swapaxes(1, 2)) <= 1e-9 * largest
     if not symmetric.all() or np.linalg.eigvalsh(found / largest).min() < -1e-9:
         raise InputError("pose_covariance: must be symmetric, without negative eigenvalues")
@@ -191,7 +214,7 @@ def _finite(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatAr
 
 def _rotations(values: npt.ArrayLike, count: int) -> FloatArray:
     """Return rotation matrices of quaternions, or as they are, shape (N, 3, 3)."""
-    array = np.asarray(values, dtype=np.float64)
+    array = array_of("orientations", values)
     if array.ndim == 2:
         q = _numbers("orientations", array, (count, 4))
         lengths = np.linalg.norm(q, axis=1)

@@ -8,6 +8,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from l2m_gtsam.api.arguments import (
+    CALIBRATION,
+    DRIVE,
+    MAP,
+    SENSORS,
+    WHOLE_MAP,
+    check,
+    drives_of,
+    refuse_paths,
+    refused,
+    sensors_of,
+)
+from l2m_gtsam.api.arrays import array_of
 from l2m_gtsam.api.options import options_of
 from l2m_gtsam.api.results import JudgedCalibration, LocalisedDrive
 from l2m_gtsam.calibration.calibrate import calibrated
@@ -35,18 +48,12 @@ from l2m_gtsam.upkeep.kept_map import kept_up
 
 Values = Mapping[str, Any]
 Structure = npt.ArrayLike | str | Path | None
-READERS = {
-    "recording": "read_bag",
-    "surveys": "read_bag",
-    "drives": "read_bag",
-    "field_map": "load_map",
-    "calibration": "read_calibration",
-}
+Suite = KnownSensor | Mapping[str, KnownSensor] | Sequence[KnownSensor] | str | Path
 
 
 def build_map(
     surveys: Recording | Sequence[Recording],
-    suite: Mapping[str, KnownSensor] | Sequence[KnownSensor] | str | Path | None = None,
+    suite: Suite | None = None,
     *,
     structure: Structure = None,
     options: MappingOptions | Values | None = None,
@@ -70,18 +77,18 @@ def build_map(
     L2MError
         Whatever is wrong with the input, in one line.
     """
-    _refuse_paths(surveys=surveys)
+    refuse_paths(surveys=surveys)
+    drives, known = drives_of("surveys", surveys), _sensors(suite)
     chosen = options_of(MappingOptions, options, "mapping")
-    drives = [surveys] if isinstance(surveys, Recording) else list(surveys)
     if structure is not None:
         refuse_structure(chosen.model.kind)
-    return map_recordings(drives, _sensors(suite), chosen, _cloud(structure, chosen))
+    return map_recordings(drives, known, chosen, _cloud(structure, chosen))
 
 
 def keep_map_up(
     field_map: FieldMap,
     drives: Recording | Sequence[Recording],
-    suite: Mapping[str, KnownSensor] | Sequence[KnownSensor] | str | Path,
+    suite: Suite,
     *,
     options: MappingOptions | Values | None = None,
     changes: ChangesOptions | Values | None = None,
@@ -108,52 +115,34 @@ def keep_map_up(
     L2MError
         Whatever is wrong with the input, in one line.
     """
-    _refuse_paths(field_map=field_map, drives=drives)
-    every = [drives] if isinstance(drives, Recording) else list(drives)
+    refuse_paths(field_map=field_map, drives=drives)
+    check(WHOLE_MAP, field_map=field_map)
+    every, known = drives_of("drives", drives), _sensors(suite)
+    if known is None:
+        raise refused("suite", suite, SENSORS)
     return kept_up(
         field_map,
         every,
-        _sensors(suite) or {},
+        known,
         options_of(MappingOptions, options, "mapping"),
         options_of(ChangesOptions, changes, "calibration.changes"),
     )
 
 
-def _refuse_paths(**given: Any) -> None:
-    """Refuse paths, and lists of them, in place of what is read from them.
-
-    Raises
-    ------
-    InputError
-        It says which function reads the file.
-    """
-    for name, value in given.items():
-        paths = value if isinstance(value, list | tuple) else [value]
-        for path in paths:
-            if isinstance(path, str | Path):
-                raise InputError(
-                    f"{name}: {str(path)!r} is a path; `l2m_gtsam.{READERS[name]}` reads it"
-                )
-
-
-def _sensors(
-    suite: Mapping[str, KnownSensor] | Sequence[KnownSensor] | str | Path | None,
-) -> Mapping[str, KnownSensor] | None:
+def _sensors(suite: Suite | None) -> Mapping[str, KnownSensor] | None:
+    if suite is None:
+        return None
     if isinstance(suite, str | Path):
         return read_known_sensors(Path(suite))
-    if suite is None or isinstance(suite, Mapping):
-        return suite
-    return {each.sensor: each for each in suite}
+    return sensors_of(suite)
 
 
-def _cloud(
-    structure: npt.ArrayLike | str | Path | None, options: MappingOptions
-) -> FloatArray | None:
+def _cloud(structure: Structure, options: MappingOptions) -> FloatArray | None:
     if structure is None:
         return None
     if isinstance(structure, str | Path):
         return read_cloud(Path(structure), options.structure.edge)
-    points = np.asarray(structure, dtype=np.float64)
+    points = array_of("structure", structure)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError(f"structure: of shape {points.shape}; needed are finite points (M, 3)")
     return thinned_cloud(points, options.structure.edge)
@@ -187,7 +176,9 @@ def calibrate(
     L2MError
         Whatever is wrong with the input, in one line.
     """
-    _refuse_paths(recording=recording, field_map=field_map)
+    refuse_paths(recording=recording, field_map=field_map)
+    check(DRIVE, recording=recording)
+    check(MAP, field_map=field_map)
     chosen = options_of(CalibrationOptions, options, "calibration")
     limits = options_of(QaOptions, qa, "qa")
     found = calibrated(recording, field_map, chosen, None, progress)
@@ -226,9 +217,12 @@ def localise(
     L2MError
         Whatever is wrong with the input, in one line.
     """
-    _refuse_paths(recording=recording, calibration=calibration, field_map=field_map)
+    refuse_paths(recording=recording, calibration=calibration, field_map=field_map)
+    check(DRIVE, recording=recording)
+    check(CALIBRATION, calibration=calibration)
     chosen = options_of(SlamOptions, options, "slam")
     known = calibration.result if isinstance(calibration, JudgedCalibration) else calibration
     if field_map is None:
         return LocalisedDrive(explore(recording, known, chosen, progress).result)
+    check(MAP, field_map=field_map)
     return LocalisedDrive(localise_recording(recording, field_map, known, chosen, progress).result)

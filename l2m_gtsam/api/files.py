@@ -5,6 +5,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from l2m_gtsam.api.arguments import WHOLE_MAP, check, path_of, paths_of
 from l2m_gtsam.api.options import options_of
 from l2m_gtsam.batch.files import SavedMap, read_drive_and_numbers
 from l2m_gtsam.batch.maps import write_map
@@ -47,10 +48,11 @@ def read_bag(
     L2MError
         Whatever is wrong with a file, in one line.
     """
-    drives = _paths(logs)
+    drives = paths_of("logs", logs)
     config = Config(bag=options_of(BagOptions, options, "bag"))
-    times = None if pose_times is None else Path(pose_times)
-    config = with_poses(config, drives, _paths(poses), times)
+    times = None if pose_times is None else path_of("pose_times", pose_times)
+    files = [] if isinstance(poses, Sequence) and not poses else paths_of("poses", poses)
+    config = with_poses(config, drives, files, times)
     return joined([read_drive_and_numbers(log, config, silent) for log in drives])
 
 
@@ -62,17 +64,17 @@ def read_calibration(path: str | Path) -> CalibrationResult:
     CalibrationError
         The file is neither of both.
     """
-    return read_sensors(Path(path))
+    return read_sensors(path_of("path", path))
 
 
 def read_suite(path: str | Path) -> dict[str, KnownSensor]:
     """Return the sensors of a `suite.yaml` by name; a CalibrationError if it is none."""
-    return read_known_sensors(Path(path))
+    return read_known_sensors(path_of("path", path))
 
 
 def load_map(path: str | Path) -> FieldMap:
     """Return the map in a file; a MapError if it is none."""
-    return SavedMap.read(Path(path)).open(silent)
+    return SavedMap.read(path_of("path", path)).open(silent)
 
 
 def save_map(path: str | Path, field_map: FieldMap, *, frame: str | None = None) -> None:
@@ -89,15 +91,13 @@ def save_map(path: str | Path, field_map: FieldMap, *, frame: str | None = None)
 
     Raises
     ------
+    InputError
+        It is no map.
     OutputError
         The file cannot be written.
     """
+    file = path_of("path", path)
+    check(WHOLE_MAP, field_map=field_map)
     named = frame or frame_of(field_map) or "map"
     provenance = {"frame": named, "version": version("l2m-gtsam")}
-    write_map(Path(path), field_map, provenance, None)
-
-
-def _paths(paths: Paths) -> list[Path]:
-    if isinstance(paths, str | Path):
-        return [Path(paths)]
-    return [Path(each) for each in paths]
+    write_map(file, field_map, provenance, None)

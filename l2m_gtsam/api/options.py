@@ -5,8 +5,9 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
+from l2m_gtsam.config import fault_in
 from l2m_gtsam.errors import ConfigError
-from l2m_gtsam.options import Options, first_fault
+from l2m_gtsam.options import Options
 
 Model = TypeVar("Model", bound=Options)
 
@@ -18,4 +19,4 @@ def options_of(model: type[Model], given: Model | Mapping[str, Any] | None, name
     try:
         return model.model_validate({} if given is None else given)
     except ValidationError as error:
-        raise ConfigError(first_fault(error, name)) from error
+        raise ConfigError(fault_in(model, error, name)) from error

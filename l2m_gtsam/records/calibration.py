@@ -14,6 +14,7 @@ from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
+from l2m_gtsam.errors import NoSuchNameError
 from l2m_gtsam.records.error_budget import (
     EXPLAINED,
     Disturbance,
@@ -443,4 +444,4 @@ class CalibrationResult:
         for entry in self.sensors:
             if entry.sensor == sensor:
                 return entry
-        raise KeyError(sensor)
+        raise NoSuchNameError.of(sensor, (entry.sensor for entry in self.sensors))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import NoSuchNameError
 from l2m_gtsam.records.calibration import Uncertainty
 
 
@@ -125,4 +126,4 @@ class DrivePlan:
         for entry in self.sensors:
             if entry.sensor == sensor:
                 return entry
-        raise KeyError(sensor)
+        raise NoSuchNameError.of(sensor, (entry.sensor for entry in self.sensors))

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import AliasChoices, Field
 
+from l2m_gtsam.errors import NoSuchNameError
 from l2m_gtsam.records.record import Record
 
 
@@ -116,7 +117,10 @@ class Verdict(Record):
         return self.level is worst([own, *(s.level for s in self.sensors)]) and all(each_follows)
 
     def __getitem__(self, sensor: str) -> SensorVerdict:
-        return next(each for each in self.sensors if each.sensor == sensor)
+        for each in self.sensors:
+            if each.sensor == sensor:
+                return each
+        raise NoSuchNameError.of(sensor, (each.sensor for each in self.sensors))
 
     def count(self, level: Level) -> int:
         """Return the number of sensors with this verdict."""

@@ -47,6 +47,16 @@ def test_a_result_shows_itself(found: JudgedCalibration) -> None:
     assert page.count("<tr>") == 1 + len(frame)
 
 
+def test_a_sensor_that_is_not_there_is_named_beside_those_that_are(
+    found: JudgedCalibration,
+) -> None:
+    for asked in (found, found.result, found.verdict):
+        with pytest.raises(KeyError) as error:
+            asked["mag_7"]
+        assert isinstance(error.value, InputError)
+        assert str(error.value).startswith("no sensor named 'mag_7'; there are mag_0")
+
+
 def test_names_are_shown_as_text(found: JudgedCalibration) -> None:
     sensor = replace(found.result.sensors[0], sensor="<script>")
     verdict = replace(
@@ -70,7 +80,9 @@ def test_where_a_drive_went() -> None:
 
 def test_wrong_options_are_one_line(found: JudgedCalibration) -> None:
     whole = drive()
-    with pytest.raises(ConfigError, match=r"^calibration.solve.speed: "):
+    with pytest.raises(
+        ConfigError, match=r"^unknown key 'calibration.solve.speed'; accepted here: .*robust"
+    ):
         l2m.calibrate(whole.recording, whole.field_map, options={"solve": {"speed": 1}})
     with pytest.raises(InputError, match=r"^structure: of shape \(3,\)"):
         l2m.build_map(whole.recording, structure=[1.0, 2.0, 3.0])

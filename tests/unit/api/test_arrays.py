@@ -55,7 +55,7 @@ def test_seconds_and_nanoseconds_quaternions_and_matrices_are_one() -> None:
         ({"stamps": SECONDS[::-1]}, "each later than the one before"),
         ({"stamps": SECONDS * 1e9}, "floating-point times must be seconds"),
         ({"stamps": [str(s) for s in SECONDS]}, "stamps: .*needed are numbers"),
-        ({"fields": {}}, "no magnetometer is given"),
+        ({"fields": {}}, "fields: an empty dict was given"),
         ({"fields": {"m": (SECONDS[1:], FIELD)}}, r"fields\['m'\]: readings: of shape"),
         ({"units": "furlong"}, "'furlong' is not known; accepted: tesla, .* microtesla per count"),
         ({"units": -1.0}, "accepted: tesla"),

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import l2m_gtsam
-from l2m_gtsam.api.calls import READERS
+from l2m_gtsam.api.arguments import READERS
 from l2m_gtsam.errors import InputError
 
 BAG, MAP, FILE = "drive.bag", Path("map.npz"), "calibration.yaml"
