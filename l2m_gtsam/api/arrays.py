@@ -21,6 +21,13 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.errors import InputError, UnitsError
+from l2m_gtsam.storage.known_sensors import (
+    LARGEST_OFFSET_S,
+    StatedClock,
+    StatedErrors,
+    checked_gains,
+    checked_place,
+)
 from l2m_gtsam.storage.units import Unit, Units, field_fault, microtesla_per
 
 LATEST_S = 9e9
@@ -90,6 +97,11 @@ def known_sensor(
     H: npt.ArrayLike = (0.0, 0.0, 0.0),
     *,
     time_offset: float = 0.0,
+    t_sigma: npt.ArrayLike | None = None,
+    C_sigma: npt.ArrayLike | None = None,
+    H_sigma: npt.ArrayLike | None = None,
+    time_offset_sigma: float | None = None,
+    covariance: npt.ArrayLike | None = None,
 ) -> KnownSensor:
     """Return a magnetometer whose calibration is known: ``B_meas = C @ B_lidar + H``.
 
@@ -105,19 +117,44 @@ def known_sensor(
         Offset in microtesla, shape (3,).
     time_offset
         Of its clock in seconds.
+    t_sigma, C_sigma, H_sigma
+        Standard deviations in m, 1 and uT, shapes (3,), (3, 3) and (3,), or one number for all of
+        them; what has none counts as exact.
+    time_offset_sigma
+        The same of the clock, in seconds.
+    covariance
+        Of (t, C row by row, H) in place of their sigmas, shape (15, 15).
 
     Raises
     ------
     InputError
-        An array has another shape, is not finite, or C cannot be inverted.
+        An array has another shape, is not finite, or C cannot be inverted; a sigma is not positive;
+        or the covariance is none.
     """
     check(NAME, name=name)
-    matrix = _finite("C", np.eye(3) if C is None else C, (3, 3))
-    if np.linalg.cond(matrix) > 1e6:
-        raise InputError("C: cannot be inverted, so that readings say nothing of the field")
-    distortion = Distortion(matrix, _finite("H", H, (3,)))
-    late = float(_finite("time_offset", time_offset, ()))
-    return KnownSensor(name, _finite("t", t, (3,)), distortion, late)
+    gains = _numbers("C", np.eye(3) if C is None else C, (3, 3))
+    place, offset = _numbers("t", t, (3,)), _numbers("H", H, (3,))
+    late = float(_numbers("time_offset", time_offset, ()))
+    if abs(late) > LARGEST_OFFSET_S:
+        raise InputError(f"time_offset: {late:g} s; at most {LARGEST_OFFSET_S:g} s are accepted")
+    errors = StatedErrors(
+        covariance=_plain(covariance),
+        t_sigma=_plain(t_sigma),
+        C_sigma=_plain(C_sigma),
+        H_sigma=_plain(H_sigma),
+        time_offset=StatedClock(sigma=_plain(time_offset_sigma)),
+    )
+    try:
+        distortion = Distortion(checked_gains(gains), offset)
+        return KnownSensor(name, checked_place(place), distortion, late, errors.known())
+    except ValueError as error:
+        told = str(error).replace("time_offset.sigma", "time_offset_sigma")  # its name in a file
+        raise InputError(f"{name}: {told}") from error
+
+
+def _plain(values: npt.ArrayLike | None) -> Any:
+    """Return an array as nested lists, which a message has in one line."""
+    return values.tolist() if isinstance(values, np.ndarray) else values
 
 
 def _all_series(fields: Mapping[str, Any], units: Units) -> tuple[FieldSeries, ...]:
@@ -206,10 +243,6 @@ def _covariance(values: npt.ArrayLike, count: int) -> FloatArray | None:
     if not symmetric.all() or np.linalg.eigvalsh(found / largest).min() < -1e-9:
         raise InputError("pose_covariance: must be symmetric, without negative eigenvalues")
     return found.copy()
-
-
-def _finite(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    return _numbers(name, values, shape)
 
 
 def _rotations(values: npt.ArrayLike, count: int) -> FloatArray:

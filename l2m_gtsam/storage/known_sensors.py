@@ -19,6 +19,7 @@ from l2m_gtsam.storage.yaml_file import checked, read_yaml, write_yaml
 SIZE, TAU = 16, 15  # (t, C row by row, H, time offset); the last is the offset
 SHAPES = {"t_sigma": (3,), "C_sigma": (3, 3), "H_sigma": (3,)}
 ROUNDING = 1e-6  # of a variance, of numbers written with few digits
+LARGEST_OFFSET_S = 10.0  # that a clock may be off by
 FARTHEST_M = 100.0  # of a sensor from the lidar: beyond it, its place is written in millimetres
 LIKE = 0.85  # of ``difflib``: two letters of seven that changed places
 # What a calibration leaves open is anywhere within these sigmas: metres, 1, uT, seconds.
@@ -148,12 +149,26 @@ def _proper(covariance: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
+def checked_place(t: FloatArray) -> FloatArray:
+    """Return the position of a sensor, metres; a ValueError if no vehicle is as large."""
+    if (away := float(np.linalg.norm(t))) > FARTHEST_M:
+        raise ValueError(f"the sensor is {away:g} m from the LiDAR; positions are in metres")
+    return t
+
+
+def checked_gains(C: FloatArray) -> FloatArray:
+    """Return a distortion matrix; a ValueError if it cannot be inverted."""
+    if np.linalg.cond(C) > 1e6:  # gains a million apart are no magnetometer's
+        raise ValueError("C cannot be inverted, so that its readings say nothing of the field")
+    return C
+
+
 class _Finite(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
 
 class _Clock(_Finite):
-    seconds: float = Field(default=0.0, ge=-10, le=10)
+    seconds: float = Field(default=0.0, ge=-LARGEST_OFFSET_S, le=LARGEST_OFFSET_S)
 
 
 class _Known(_Finite):
@@ -174,16 +189,12 @@ class _Known(_Finite):
     @field_validator("t_lidar_mag")
     @classmethod
     def _near(cls, t: Vector) -> Vector:
-        if (away := float(np.linalg.norm(t))) > FARTHEST_M:
-            raise ValueError(f"the sensor is {away:g} m from the LiDAR; positions are in metres")
-        return t
+        return checked_place(t)
 
     @field_validator("C")
     @classmethod
     def _invertible(cls, C: Matrix) -> Matrix:
-        if np.linalg.cond(C) > 1e6:  # gains a million apart are no magnetometer's
-            raise ValueError("C cannot be inverted, so that its readings say nothing of the field")
-        return C
+        return checked_gains(C)
 
 
 class _Stated(_Known):
