@@ -28,7 +28,7 @@ from l2m_gtsam.storage.known_sensors import (
     checked_gains,
     checked_place,
 )
-from l2m_gtsam.storage.units import Unit, Units, field_fault, microtesla_per
+from l2m_gtsam.storage.units import Unit, Units, field_fault, microtesla_per, strength_fault
 
 LATEST_S = 9e9
 
@@ -57,7 +57,8 @@ def drive(
         (N, 3, 3).
     fields
         Of each magnetometer by name its times as those of the poses, shape (M,), and its readings
-        in its own axes, shape (M, 3); NaN marks a missing one.
+        in its own axes, shape (M, 3); NaN marks a missing one. Of readings with one stamp the first
+        counts. One of several magnetometers may have no readings.
     units
         Unit of the readings: `tesla`, `millitesla`, `microtesla`, `nanotesla`, `gauss`,
         `milligauss`, or a number, microtesla per count.
@@ -163,11 +164,18 @@ def _all_series(fields: Mapping[str, Any], units: Units) -> tuple[FieldSeries, .
     for name in fields:
         check(NAME, **{"fields: a name": name})
     pairs = {name: pair_of(f"fields[{name!r}]", fields[name]) for name in sorted(fields)}
-    return tuple(_series(name, *pair, units) for name, pair in pairs.items())
+    series = tuple(_series(name, *pair, units) for name, pair in pairs.items())
+    if not any(np.isfinite(each.field).all(axis=1).any() for each in series):
+        raise InputError(f"fields: no finite reading in {', '.join(pairs)}")
+    return series
 
 
 def _series(name: str, stamps: npt.ArrayLike, readings: npt.ArrayLike, units: Units) -> FieldSeries:
     times = _stamps(f"fields[{name!r}]: stamps", stamps)
+    if len(times) > 1 and not times.any():
+        raise InputError(f"fields[{name!r}]: stamps: all are 0; give the times of the readings")
+    if not len(times) and np.size(readings) == 0:
+        readings = np.empty((0, 3))  # an empty list has no columns
     field = _numbers(f"fields[{name!r}]: readings", readings, (len(times), 3), finite=False)
     if wrong := _strength_fault(field, units):
         raise UnitsError(f"fields[{name!r}]: {wrong}")
@@ -177,10 +185,12 @@ def _series(name: str, stamps: npt.ArrayLike, readings: npt.ArrayLike, units: Un
 
 
 def _strength_fault(field: FloatArray, units: Units) -> str | None:
-    """Return what is wrong with readings; a named unit is judged as a type's would be."""
-    if isinstance(units, Unit):
-        return field_fault(field, Unit.AUTO, units)
-    return field_fault(field, units, None)
+    """Return what is wrong with readings; a named unit is judged as a type's would be.
+
+    Constant readings are judged, too: whoever gives arrays gives all of one unit.
+    """
+    judged, own = (Unit.AUTO, units) if isinstance(units, Unit) else (units, None)
+    return field_fault(field, judged, own) or strength_fault(field, judged, own)
 
 
 def _units(units: str | float) -> Units:

@@ -120,8 +120,16 @@ def field_fault(written: FloatArray, units: Units, own: Unit | None) -> str | No
             f"every reading is {found.median:.4g} long, as written: directions without a "
             "strength (no unit at all), which cannot be calibrated; record the raw field"
         )
-    low, high = PLAUSIBLE_UT
-    if units is not Unit.AUTO:
+    return strength_fault(written, units, own)
+
+
+def strength_fault(written: FloatArray, units: Units, own: Unit | None) -> str | None:
+    """Return what is wrong with the strength of readings alone; see ``field_fault``.
+
+    Readings that are all the same are judged, too; not those of a dead sensor, which are zeros.
+    """
+    found, (low, high) = strength(written), PLAUSIBLE_UT
+    if units is not Unit.AUTO or not found.high > 0:
         return None
     if own is not None and low <= found.median * MICROTESLA_PER[own] <= high:
         return None

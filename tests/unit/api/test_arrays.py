@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import l2m_gtsam as l2m
 from l2m_gtsam.errors import InputError, L2MError, UnitsError
+from l2m_gtsam.recording.sync import SyncOptions, synchronise
 
 COUNT = 40
 SECONDS = 1000.0 + 0.1 * np.arange(COUNT)
@@ -72,6 +73,35 @@ def test_what_does_not_fit_is_one_line(changed: dict[str, Any], told: str) -> No
 def test_units_are_checked() -> None:
     with pytest.raises(UnitsError, match=r"0.4.* uT, as read in microtesla.*`units: gauss`"):
         l2m.drive(**given(fields={"mag": (SECONDS, FIELD / 100)}))
+
+
+def test_constant_readings_are_checked_too() -> None:
+    constant = np.tile([0.0, 2e-5, -4e-5], (COUNT, 1))
+    with pytest.raises(UnitsError, match=r"^fields\['mag'\]: .* in microtesla.*`units: tesla`"):
+        l2m.drive(**given(fields={"mag": (SECONDS, constant)}))
+    for stuck in (np.tile([0.0, 20.0, -40.0], (COUNT, 1)), np.zeros((COUNT, 3))):
+        l2m.drive(
+            **given(fields={"mag": (SECONDS, stuck)})
+        )  # its calibration says that it is stuck
+
+
+def test_a_sensor_without_readings_is_one_of_several() -> None:
+    fields: dict[str, Any] = {"mag": (SECONDS, FIELD), "none": ([], [])}
+    assert [len(each) for each in l2m.drive(**given(fields=fields)).series] == [COUNT, 0]
+    nothings: list[Any] = [([], []), (SECONDS, np.full_like(FIELD, np.nan))]
+    for nothing in nothings:
+        with pytest.raises(InputError, match="no finite reading in mag"):
+            l2m.drive(**given(fields={"mag": nothing}))
+
+
+def test_of_readings_with_one_stamp_the_first_counts() -> None:
+    twice = np.repeat(SECONDS[::2], 2)
+    recording = l2m.drive(**given(fields={"mag": (twice, FIELD)}))
+    found = synchronise(recording, SyncOptions(thin_distance_m=0, thin_angle_deg=0))
+    assert found.counts[0].repeated == COUNT // 2
+    np.testing.assert_array_equal(found.readings.field, FIELD[::2][: len(found.readings)])
+    with pytest.raises(InputError, match=r"fields\['mag'\]: stamps: all are 0"):
+        l2m.drive(**given(fields={"mag": (0 * SECONDS, FIELD)}))
 
 
 def test_known_sensors() -> None:
