@@ -73,7 +73,7 @@ NOTHING = CalibrationResult((), 0, Uncertainty.INDEPENDENT, (), (), None, None, 
     [
         lambda drive, field_map: l2m.calibrate(drive, field_map),
         lambda drive, field_map: l2m.localise(drive, NOTHING, field_map),
-        lambda drive, field_map: l2m.keep_map_up(field_map, drive, []),
+        lambda drive, field_map: l2m.keep_map_up(field_map, drive, l2m.known_sensor("mag")),
         lambda drive, field_map: plan(drive, field_map, OPTIONS, PlanOptions()),
         lambda drive, field_map: validate(drive, field_map, NOTHING, OPTIONS, 0.01),
     ],
