@@ -167,5 +167,5 @@ def _uncertain(
     optimum = UncertainOptimum.at(problem, values)
     solved = optimum.solutions()
     if options.warp_m > 0 and sigmas_hold(errors):
-        return optimum.with_unseen(solved, optimum.unseen_warp(options.warp_m))
+        return optimum.with_unseen(solved, optimum.foretold_warp(options.warp_m))
     return solved

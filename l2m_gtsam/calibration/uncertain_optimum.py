@@ -17,7 +17,7 @@ from l2m_gtsam.calibration.budget.search import (
     process_information,
     search,
 )
-from l2m_gtsam.calibration.budget.unseen_warp import UnseenWarp, unseen_warp
+from l2m_gtsam.calibration.budget.unseen_warp import UnseenWarp, foretold_warp, unseen_warp
 from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.coverage import Coverage
 from l2m_gtsam.calibration.half_difference import (
@@ -121,6 +121,10 @@ class UncertainOptimum:
     def unseen_warp(self, before_m: float) -> UnseenWarp:
         """Return the bend of the frame that residuals leave possible; none is in the graph."""
         return unseen_warp(self._informed([Warp.of(self._places)]), before_m)
+
+    def foretold_warp(self, before_m: float) -> UnseenWarp:
+        """Return that of a drive that is yet to be read."""
+        return foretold_warp(self._informed([Warp.of(self._places)]), before_m)
 
     def with_unseen(
         self, solved: Sequence[SensorSolution], unseen: UnseenWarp

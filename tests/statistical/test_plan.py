@@ -123,7 +123,9 @@ def _recorded(
     return Recording(drive, (series,), SourceFile("drive.bag", "ab12"))
 
 
-WITHIN = 1.3  # the promise: 30 % either way
+# The promise: 30 % either way, and 40 % where readings do not tell how far the frame is bent. What
+# that adds to C hangs on the noise of the drive, of which a plan knows the mean alone.
+WITHIN = 1.4
 
 
 def assert_agree(found: list[Agreement]) -> None:

@@ -238,6 +238,7 @@ def test_a_browser_that_fails_leaves_no_pdf(
     assert not (made.folder / "report.pdf").exists()
 
 
+@pytest.mark.usefixtures("reported")  # judged once already
 def test_thresholds_that_remove_a_reason_leave_a_trace(made: Made, tmp_path: Path) -> None:
     """On the page and in the terminal, also where the level stays; halves can be left out."""
     shutil.copytree(made.folder, tmp_path / "made")

@@ -8,7 +8,7 @@ import pytest
 
 from l2m_gtsam.calibration.budget.processes import Warp
 from l2m_gtsam.calibration.budget.search import ProcessInformation, process_information
-from l2m_gtsam.calibration.budget.unseen_warp import unseen_warp
+from l2m_gtsam.calibration.budget.unseen_warp import foretold_warp, unseen_warp
 from l2m_gtsam.calibration.joint_information import Rows, joint_information
 from l2m_gtsam.data import FloatArray
 from tests.support.scenes import scene
@@ -73,6 +73,16 @@ def test_moments_are_those_of_all_sizes_one_by_one() -> None:
     # good to a thousandth; what is smaller or larger than the grid has less than that.
     np.testing.assert_allclose(found.root @ found.root.T, slow, rtol=5e-3)
     assert found.size_m == pytest.approx(np.sqrt(squares / weight), rel=5e-3)
+
+
+def test_what_is_foretold_is_what_straight_frames_leave() -> None:
+    """In the mean of many drives along a frame that is not bent."""
+    rng = np.random.default_rng(3)
+    found = [unseen_warp(bent(0.0, rng).known, BEFORE_M) for _ in range(200)]
+    counted = np.mean([np.diag(each.root @ each.root.T) for each in found], axis=0)
+    foretold = foretold_warp(bent(0.0, rng).known, BEFORE_M)
+    # The posterior of the mean pull is not the mean of the posteriors.
+    np.testing.assert_allclose(np.diag(foretold.root @ foretold.root.T), counted, rtol=0.3)
 
 
 def test_what_is_counted_is_what_bends_do() -> None:
