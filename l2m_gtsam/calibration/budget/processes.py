@@ -31,7 +31,7 @@ POSE_PARTS = {  # of rotation and translation along the axes of the lidar
     "height": (0, 0, 0, 0, 0, 1),
 }
 WARP_M = (3.0, 8.0)  # lengths over which a frame may be bent
-BEYOND_M = 2.0  # cosines are level at their ends: these lie outside the drive
+BEYOND_M = 8.0  # cosines are level at their ends: these lie as far outside as bends are long
 FAINT = 0.01  # of the largest variance of a mode: what less have is left out
 
 
@@ -328,10 +328,13 @@ class Warp:
     """The drive's frame is bent against the map's, in the plane of the floor.
 
     Poses on a bent frame are shifted, and turned with it: by half the curl of the shifts.
+    ``spectra`` has the variances of the modes for shifts of unit variance over the drive, for each
+    of ``WARP_M``, shape (2, J).
     """
 
     places: ReadingPlaces
     modes: FloorModes
+    spectra: FloatArray
     kind: DisturbanceKind = DisturbanceKind.WARP
     sensor: int | None = None
 
@@ -339,13 +342,16 @@ class Warp:
     def of(cls, places: ReadingPlaces) -> "Warp":
         """Return the modes over the floor of some readings."""
         finest = np.sqrt(-2 * np.log(FAINT)) / min(WARP_M)  # wavenumber that still counts
-        return cls(places, FloorModes.over(places.readings.p_map_lidar, finest))
+        p = places.readings.p_map_lidar
+        modes = FloorModes.over(p, finest)
+        variance = np.exp(-0.5 * np.square(WARP_M)[:, None] * modes.wavenumber2)
+        over_drive = np.square(modes.values(p)).mean(axis=0)
+        return cls(places, modes, variance / (variance @ over_drive)[:, None])
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
         """Of two lengths together, m^2."""
-        variance = np.exp(-0.5 * np.square(WARP_M)[:, None] * self.modes.wavenumber2)
-        return (np.repeat(variance / variance.sum(axis=1, keepdims=True), 2, axis=1),)
+        return (np.repeat(self.spectra, 2, axis=1),)
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what shifts along x and y of the map make of the field, shape (n, 3, m)."""
