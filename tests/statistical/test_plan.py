@@ -124,7 +124,7 @@ def _recorded(
 
 
 WITHIN = 1.3  # the promise: 30 % either way
-# A bend of the frame turns headings, and with them C_xy and C_yx. How much of one the readings leave
+# A bend of the frame turns headings, and with them C_xy and C_yx. How much of one readings leave
 # open hangs on the noise of the drive, of which a plan knows the mean alone.
 TURNED, OF_TURNED = [4, 6], 1.5
 
@@ -146,7 +146,10 @@ def test_planned_sigmas_are_those_found_afterwards() -> None:
 
 @pytest.mark.study
 def test_planned_sigmas_of_fifty_drives() -> None:
-    """They were 0.77 to 1.24 times those found (C_xy, C_yx: 0.68 to 1.27): places taped to 3 cm, distortions unknown."""
+    """They were 0.77 to 1.24 times those found, C_xy and C_yx 0.68 to 1.27 times.
+
+    Places taped to 3 cm, distortions unknown.
+    """
     found = list(agreements(worlds=5, drives=10))
     assert len(found) == 50
     assert_agree(found)
