@@ -301,7 +301,6 @@ def robust_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
         s = found.sensor
         rows = problem.batch.rows_of(s)
         residual = problem.batch.residuals(values, s).residual[rows]
-        white = np.einsum("nij,nj->ni", optimum.whitenings[rows], residual)
         white = (W[rows] @ residual[:, :, None]).ravel()
         own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
         covariance, together = HalfCovariance.of(optimum.among((s,))), len(problem.view.sensors)

@@ -25,11 +25,11 @@ def report_id(content: Mapping[str, Any]) -> str:
     content
         As YAML or JSON has it; an ``id`` in it does not count.
     """
-    told = {key: value for key, value in content.items() if key != ID}
+    said = {key: value for key, value in content.items() if key != ID}
     try:
-        text = json.dumps(told, sort_keys=True, separators=(",", ":"), default=repr)
+        text = json.dumps(said, sort_keys=True, separators=(",", ":"), default=repr)
     except (TypeError, ValueError):  # keys that are no text: not of this program
-        text = repr(told)
+        text = repr(said)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

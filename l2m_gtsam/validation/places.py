@@ -21,8 +21,10 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, LidarMotion, Readings
 from l2m_gtsam.maps.sources.found_sources import FoundSources, price, refined
 from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.validation import EXPECTED_TIMES
 from l2m_gtsam.records.places import CLEAR, ChangedSource, WhatChanged
-from l2m_gtsam.records.validation import CalibrationPart
+from l2m_gtsam.records.validation import CalibrationPart, NotValidated, ValidatedSensor
 from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
 
 TIE = "The readings do not show which"
@@ -178,6 +180,32 @@ def shown_sources(
     shown = drive_sources(rows, drive, places, field_map, options.sources)
     found = shown.of_changes()
     return ShownSources(shown.rows, drive, found) if len(found) else None
+
+
+def is_elsewhere(
+    found: Sequence[ValidatedSensor | NotValidated],
+    beside: Sequence[ValidatedSensor | NotValidated],
+) -> bool:
+    """Return whether the map is of another place, or in another frame.
+
+    It then explains the readings of no sensor, and steel makes up for that in no sensor either:
+    what is found are patches, not steel.
+
+    Parameters
+    ----------
+    found, beside
+        Sensors tested in the map, and with the steel that was found.
+    """
+    unlike = QaOptions().unexplained.fail
+    pairs = [
+        (one, other)
+        for one, other in zip(found, beside, strict=True)
+        if isinstance(one, ValidatedSensor) and isinstance(other, ValidatedSensor)
+    ]
+    return bool(pairs) and all(
+        one.unexplained > unlike and other.refitted > EXPECTED_TIMES * other.expected
+        for one, other in pairs
+    )
 
 
 def is_searched(field_map: QueryableMap, options: ChangesOptions) -> bool:

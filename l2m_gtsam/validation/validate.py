@@ -40,6 +40,7 @@ from l2m_gtsam.validation.figures import Thinning, doubts_and_notes, offset_s, s
 from l2m_gtsam.validation.innovation import KnownCalibration
 from l2m_gtsam.validation.places import (
     PlaceOrVehicle,
+    is_elsewhere,
     is_searched,
     shown_sources,
     together,
@@ -47,8 +48,6 @@ from l2m_gtsam.validation.places import (
 )
 from l2m_gtsam.validation.recheck import SensorDrive, finite, recheck
 
-UNLIKE = 0.75  # of what a uniform field leaves: what a map of another place does
-PATCHED = 2.0  # times what is expected of residuals: more is left where steel is not the reason
 NO_STEEL = "the readings show no steel that came or went"
 
 
@@ -212,31 +211,6 @@ def _judged(
         for which in (found, beside)
     )
     return shown.judged(covariances, alone, besides), beside
-
-
-def is_elsewhere(
-    found: Sequence[ValidatedSensor | NotValidated],
-    beside: Sequence[ValidatedSensor | NotValidated],
-) -> bool:
-    """Return whether the map is of another place, or in another frame.
-
-    It then explains the readings of no sensor, and steel makes up for that in no sensor either:
-    what is found are patches, not steel.
-
-    Parameters
-    ----------
-    found, beside
-        Sensors tested in the map, and with the steel that was found.
-    """
-    pairs = [
-        (one, other)
-        for one, other in zip(found, beside, strict=True)
-        if isinstance(one, ValidatedSensor) and isinstance(other, ValidatedSensor)
-    ]
-    return bool(pairs) and all(
-        one.unexplained > UNLIKE and other.refitted > PATCHED * other.expected
-        for one, other in pairs
-    )
 
 
 def parts_of(found: ValidatedSensor | NotValidated) -> tuple[CalibrationPart, ...]:
