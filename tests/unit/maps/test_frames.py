@@ -42,7 +42,7 @@ def driven(frame: str = "odom") -> Recording:
 def test_a_map_keeps_the_name_of_its_frame(kind: str) -> None:
     field_map = mapped(kind)
     updated = field_map.updated(POINTS[:5] + 0.01, FIELD[:5])
-    sent = pickle.loads(pickle.dumps(field_map))  # noqa: S301
+    sent = pickle.loads(pickle.dumps(field_map))  # noqa: S301 - made here
     for each in (field_map, updated, sent):
         assert frame_of(each) == "map"
     state = field_map.to_state()
