@@ -5,7 +5,7 @@ lidar frame to the map frame. Positions are in metres, magnetic field in microte
 integer nanoseconds.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -229,15 +229,32 @@ class LidarMotion:
     ----------
     twist_lidar
         Angular velocity in rad/s and linear velocity in m/s, both in the lidar frame, shape (N, 6).
+    acceleration_lidar
+        How these grow, rad/s^2 and m/s^2, in the frame of the lidar at the reading, shape (N, 6).
     offset
         Time offset in seconds: the poses are those at stamp + offset, shape (N,).
     """
 
     twist_lidar: FloatArray
+    acceleration_lidar: FloatArray
     offset: FloatArray
 
+    @classmethod
+    def steady(cls, twist_lidar: FloatArray) -> "LidarMotion":
+        """Return motion at constant velocities, shape (N, 6), with poses at the stamps."""
+        return cls(twist_lidar, np.zeros_like(twist_lidar), np.zeros(len(twist_lidar)))
+
+    @classmethod
+    def joined(cls, parts: Sequence["LidarMotion"]) -> "LidarMotion":
+        """Return the motion at all readings of some parts."""
+        return cls(
+            np.concatenate([each.twist_lidar for each in parts]),
+            np.concatenate([each.acceleration_lidar for each in parts]),
+            np.concatenate([each.offset for each in parts]),
+        )
+
     def __getitem__(self, rows: IntArray) -> "LidarMotion":
-        return LidarMotion(self.twist_lidar[rows], self.offset[rows])
+        return LidarMotion(self.twist_lidar[rows], self.acceleration_lidar[rows], self.offset[rows])
 
 
 @dataclass(frozen=True)

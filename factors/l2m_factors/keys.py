@@ -56,6 +56,11 @@ def K(sensor: int) -> int:
     return int(gtsam.symbol("K", sensor))
 
 
+def L(sensor: int) -> int:
+    """Return the key of how this sensor smooths its readings (low-pass): Vector, unit variance."""
+    return int(gtsam.symbol("L", sensor))
+
+
 def B() -> int:
     """Return the key of how the field differs from the map's in time: Vector, unit variance."""
     return int(gtsam.symbol("B", 0))

@@ -31,6 +31,7 @@ BY_SYMBOL = {
     "B": ErrorCause.FIELD,
     "F": ErrorCause.WARP,
     "K": ErrorCause.CLOCK,
+    "L": ErrorCause.SMOOTHING,
 }
 LEAST = 1e-3  # of a variance: less is not listed
 Parts = dict[ErrorCause, FloatArray]

@@ -184,8 +184,8 @@ def with_motion(readings: Readings, motion: ExtraMotion) -> Readings:
     S, K, moving, roots = len(readings.sensors), len(motion.p), None, readings.pose_root
     later = BREAK_NS + np.round(NANOSECONDS * motion.seconds).astype(np.int64)
     if readings.motion is not None:
-        twist = np.concatenate([readings.motion.twist_lidar, np.tile(motion.twist, (S, 1))])
-        moving = LidarMotion(twist, np.zeros(len(twist)))
+        added = LidarMotion.steady(np.tile(motion.twist, (S, 1)))
+        moving = LidarMotion.joined([readings.motion, added])
     sensor = np.concatenate([readings.sensor, np.repeat(np.arange(S), K)])
     joined = Readings(
         readings.sensors,

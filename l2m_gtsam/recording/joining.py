@@ -251,15 +251,10 @@ def _source(drives: Sequence[Recording]) -> SourceFile:
 def _motion(readings: Sequence[Readings]) -> LidarMotion | None:
     if all(each.motion is None for each in readings):
         return None
-    motions = [
-        LidarMotion(np.zeros((len(each), 6)), np.zeros(len(each)))
-        if each.motion is None
-        else each.motion
-        for each in readings
-    ]
-    return LidarMotion(
-        np.concatenate([each.twist_lidar for each in motions]),
-        np.concatenate([each.offset for each in motions]),
+    at_rest = (LidarMotion.steady(np.zeros((len(each), 6))) for each in readings)
+    known = (each.motion for each in readings)
+    return LidarMotion.joined(
+        [rest if moving is None else moving for moving, rest in zip(known, at_rest, strict=True)]
     )
 
 

@@ -41,6 +41,9 @@ class SyncOptions(Options):
 STUCK_UT = 1e-3
 # Velocities are taken over this time: between two poses their noise would be a large part.
 TWIST_S = 0.1
+# And accelerations over this: to either side a period of poses at 10 Hz, between which they are
+# interpolated.
+ACCELERATION_S = 0.2
 
 
 def synchronise(
@@ -184,18 +187,18 @@ def with_offsets(readings: Readings, trajectory: Trajectory, offset: FloatArray)
     """
     own = offset[readings.sensor]
     if not len(readings):
-        motion = LidarMotion(np.empty((0, 6)), own)
+        motion = LidarMotion.steady(np.empty((0, 6)))
         return replace(
             readings, R_map_lidar=np.empty((0, 3, 3)), p_map_lidar=np.empty((0, 3)), motion=motion
         )
     at = 1e-9 * (readings.stamp_ns - trajectory.stamp_ns[0]) + own
     R, p, twist = _moving_at(trajectory, at)
-    motion = LidarMotion(twist, own)
+    motion = LidarMotion(twist, _accelerations(trajectory, at, R, p), own)
     return replace(readings, R_map_lidar=R, p_map_lidar=p, motion=motion)
 
 
 def at_poses(readings: Readings, trajectory: Trajectory, offset: FloatArray) -> Readings:
-    """Return readings as ``with_offsets``, but without the lidar's motion, a third of the work."""
+    """Return readings as ``with_offsets``, but without the lidar's motion, a fifth of the work."""
     own = offset[readings.sensor]
     R, p = _poses_at(trajectory, 1e-9 * (readings.stamp_ns - trajectory.stamp_ns[0]) + own)
     return replace(readings, R_map_lidar=R, p_map_lidar=p, motion=None)
@@ -244,6 +247,22 @@ def _moving_at(trajectory: Trajectory, at: FloatArray) -> tuple[FloatArray, Floa
     return R, p, np.hstack([turn, shift]) / between
 
 
+def _accelerations(
+    trajectory: Trajectory, at: FloatArray, R: FloatArray, p: FloatArray
+) -> FloatArray:
+    """Return how the lidar's twist grows at poses, (N, 3, 3) and (N, 3), of N times, shape (N, 6).
+
+    Beyond its ends the lidar stands still: accelerations there are none of a drive, and zero.
+    """
+    half, N = ACCELERATION_S / 2, len(at)
+    end = 1e-9 * float(trajectory.stamp_ns[-1] - trajectory.stamp_ns[0])
+    around, places = _poses_at(trajectory, np.concatenate([at - half, at + half]))
+    turns = Rotation.from_matrix(np.concatenate([R, R]).transpose(0, 2, 1) @ around).as_rotvec()
+    way = np.einsum("nji,nj->ni", R, places[:N] + places[N:] - 2 * p)
+    growth = np.hstack([turns[:N] + turns[N:], way]) / half**2
+    return np.where(((at < half) | (at > end - half))[:, None], 0.0, growth)
+
+
 def _first_in_cell(readings: Readings, options: SyncOptions) -> BoolArray:
     """Mark the first reading of every cell of position and rotation."""
     sizes = options.thin_distance_m, float(np.deg2rad(options.thin_angle_deg))
@@ -268,10 +287,7 @@ def _concatenate(recording: Recording, parts: list[Readings]) -> Readings:
         R_map_lidar=np.concatenate([part.R_map_lidar for part in parts]),
         p_map_lidar=np.concatenate([part.p_map_lidar for part in parts]),
         field=np.concatenate([part.field for part in parts]),
-        motion=LidarMotion(
-            np.concatenate([motion.twist_lidar for motion in motions]),
-            np.concatenate([motion.offset for motion in motions]),
-        ),
+        motion=LidarMotion.joined(motions),
     )
 
 

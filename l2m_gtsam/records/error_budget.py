@@ -27,6 +27,8 @@ class ErrorCause(StrEnum):
     """A frame that is bent against the map's."""
     CLOCK = "clock"
     """A clock that drifts against that of the poses."""
+    SMOOTHING = "smoothing"
+    """Readings that are means over some time."""
     CURRENTS = "currents"
     """What recorded numbers add to the readings."""
     PRIORS = "priors"
@@ -67,6 +69,8 @@ class DisturbanceKind(StrEnum):
     """The drive's frame is bent against the map's."""
     CLOCK = "clock"
     """The time offset of a sensor is not constant."""
+    SMOOTHING = "smoothing"
+    """A sensor's readings are smoothed over some time, against the poses."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,8 @@ class Disturbance:
         ``walk_ut`` (from the start to the end of a drive) of H or of a field; of poses in the
         lidar's frame ``tilt_deg`` and ``floor_m`` (along x and y), ``heading_deg`` and
         ``height_m`` (along z); how long an error lasts, ``lasting_s``; ``shift_m``, of the
-        floor's axes; ``drift_s``, of a clock from the start to the end of a drive.
+        floor's axes; ``drift_s``, of a clock from the start to the end of a drive;
+        ``smoothing_s``, of the time that a reading is a mean over.
     gain
         Twice the logarithm by which the drive is more likely with it.
     sensor

@@ -107,8 +107,9 @@ MODEL = {
     "exact": "what counts as exact, for want of stated errors: sigmas know nothing of its errors",
     "disturbances": (
         "processes found beside noise and the map's errors, which covariances hold: wander of H, "
-        "errors of poses that last, a drive's frame that is bent against the map's; sizes are "
-        "standard deviations, gain is twice a logarithm of likelihood"
+        "errors of poses that last, a drive's frame that is bent against the map's, a clock that "
+        "drifts, readings that are smoothed; sizes are standard deviations, gain is twice a "
+        "logarithm of likelihood"
     ),
     "stated": (
         "errors whose standard deviations were stated: ratio of what the readings show to what was "

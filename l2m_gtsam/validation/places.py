@@ -235,13 +235,7 @@ def together(parts: Sequence[Readings], names: tuple[str, ...]) -> Readings:
         known = [each for each in values if each is not None]
         return np.concatenate(known) if len(known) == len(parts) else None
 
-    moving = [each.motion for each in parts]
-    motion = None
-    if all(each is not None for each in moving):
-        motion = LidarMotion(
-            np.concatenate([each.twist_lidar for each in moving if each is not None]),
-            np.concatenate([each.offset for each in moving if each is not None]),
-        )
+    moving = [each.motion for each in parts if each.motion is not None]
     return Readings(
         sensors=names,
         sensor=np.repeat(np.arange(len(parts)), counts),
@@ -249,6 +243,6 @@ def together(parts: Sequence[Readings], names: tuple[str, ...]) -> Readings:
         R_map_lidar=np.concatenate([each.R_map_lidar for each in parts]),
         p_map_lidar=np.concatenate([each.p_map_lidar for each in parts]),
         field=np.concatenate([each.field for each in parts]),
-        motion=motion,
+        motion=LidarMotion.joined(moving) if len(moving) == len(parts) else None,
         pose_root=joined([each.pose_root for each in parts]),
     )

@@ -1,4 +1,4 @@
-"""The processes of a drive as variables of the last graph: ``W(i)``, ``K(i)``, ``B()`` and ``F()``.
+"""The processes of a drive as variables of the last graph: ``W(i)``, ``K(i)`` and so on.
 
 Weights have unit variance there. Errors of poses become those of ``pose_errors``, which know how
 they go on between the knots, as if they had been stated.
@@ -11,7 +11,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from l2m_factors import B, F, K, SharedError, W
+from l2m_factors import B, F, K, L, SharedError, W
 from l2m_gtsam.calibration.budget.processes import (
     LASTING_S,
     POSE_PARTS,
@@ -23,6 +23,7 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.error_budget import Disturbance, DisturbanceKind
 
 AXES = 3
+OF_A_SENSOR = {DisturbanceKind.WANDER: W, DisturbanceKind.CLOCK: K, DisturbanceKind.SMOOTHING: L}
 
 
 @dataclass(frozen=True)
@@ -114,10 +115,10 @@ def spread_of_H(found: FoundProcess, weights: FloatArray, covariance: FloatArray
 
 
 def _key(found: FoundProcess) -> int:
-    sensor = found.process.sensor
+    sensor, kind = found.process.sensor, found.process.kind
     if sensor is not None:
-        return K(sensor) if found.process.kind is DisturbanceKind.CLOCK else W(sensor)
-    return B() if found.process.kind is DisturbanceKind.FIELD else F()
+        return OF_A_SENSOR[kind](sensor)
+    return B() if kind is DisturbanceKind.FIELD else F()
 
 
 def _record(found: FoundProcess, sensors: Sequence[str]) -> Disturbance:

@@ -15,6 +15,7 @@ from l2m_gtsam.calibration.budget.processes import (
     Wander,
     Warp,
 )
+from l2m_gtsam.calibration.budget.smoothing import Smoothing
 
 # Of each of six errors of poses, and of fields: what lasts a second is half a wave of 1.75 s and
 # more. With fewer modes than that, errors of poses look like fields.
@@ -30,6 +31,7 @@ def processes(places: ReadingPlaces, sensors: Sequence[int]) -> tuple[Process, .
     if readings.motion is not None:
         slowest = TimeModes.over(readings, CLOCK_MODES)
         found += [ClockDrift(places, sensor, slowest) for sensor in sensors]
+        found += [Smoothing(places, sensor) for sensor in sensors]
     count = int(np.clip(np.ceil(slow.duration.max() / FINEST_S), *FAST_MODES))
     fast = TimeModes.over(readings, count)
     if len(sensors) > 1:  # of one sensor's wander it cannot be told

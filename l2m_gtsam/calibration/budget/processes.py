@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
+from l2m_factors import DifferentiableMap, PoseMotion, moved
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.pose_errors import pose_features
 from l2m_gtsam.calibration.view import QueryableMap, places_of
@@ -31,6 +32,7 @@ POSE_PARTS = {  # of rotation and translation along the axes of the lidar
     "height": (0, 0, 0, 0, 0, 1),
 }
 WARP_M = (3.0, 8.0)  # lengths over which a frame may be bent
+BEND_S = 0.1  # to either side; a filter of 50 ms has weight so far
 BEYOND_M = 8.0  # cosines are level at their ends: these lie as far outside as bends are long
 FAINT = 0.01  # of the largest variance of a mode: what less have is left out
 
@@ -53,6 +55,9 @@ class ReadingPlaces:
         Field in the lidar frame in uT, shape (N, 3).
     slope
         How it grows along the axes of the map, ``R^T G`` in uT/m, shape (N, 3, 3).
+    bend
+        Its second derivative along the drive in uT/s^2, lidar frame, shape (N, 3); absent where it
+        is not known how the lidar moves.
     """
 
     readings: Readings
@@ -61,6 +66,7 @@ class ReadingPlaces:
     x: FloatArray
     b_lidar: FloatArray
     slope: FloatArray
+    bend: FloatArray | None = None
 
     @classmethod
     def of(cls, readings: Readings, field_map: QueryableMap, estimate: Estimate) -> "ReadingPlaces":
@@ -70,7 +76,36 @@ class ReadingPlaces:
         R_lidar_map = readings.R_map_lidar.transpose(0, 2, 1)
         b_lidar = np.einsum("nij,nj->ni", R_lidar_map, field)
         t, C = estimate.t[readings.sensor], estimate.C()[readings.sensor]
-        return cls(readings, t, C, x, b_lidar, R_lidar_map @ gradient)
+        bend = field_bend(readings, field_map, t, b_lidar)
+        return cls(readings, t, C, x, b_lidar, R_lidar_map @ gradient, bend)
+
+
+def field_bend(
+    readings: Readings, field_map: DifferentiableMap, t: FloatArray, b_lidar: FloatArray
+) -> FloatArray | None:
+    """Return the second derivative of the field along a drive in uT/s^2, lidar frame, (N, 3).
+
+    Parameters
+    ----------
+    readings
+        N of them; of ``None`` there is none where they do not say how the lidar moves.
+    field_map
+        What is asked a moment before and after each; where it knows nothing the field is straight.
+    t
+        Of their sensors in the lidar frame in metres, shape (N, 3).
+    b_lidar
+        Field at the readings in the lidar frame in uT, shape (N, 3).
+    """
+    if readings.motion is None:
+        return None
+    bend = -2 * b_lidar
+    for step in (-BEND_S, BEND_S):
+        twist = readings.motion.twist_lidar + 0.5 * step * readings.motion.acceleration_lidar
+        motion = PoseMotion(twist, np.zeros(len(t)))
+        R, p = moved(readings.R_map_lidar, readings.p_map_lidar, motion, np.full(len(t), step))
+        field, _ = field_map.field_and_gradient(p + np.einsum("nij,nj->ni", R, t))
+        bend += np.einsum("nji,nj->ni", R, field)
+    return np.asarray(np.nan_to_num(bend / BEND_S**2))
 
 
 class Process(Protocol):

@@ -21,6 +21,7 @@ NAMES = {
     ErrorCause.FIELD: "a field that changed",
     ErrorCause.WARP: "a bent frame",
     ErrorCause.CLOCK: "a clock that drifts",
+    ErrorCause.SMOOTHING: "smoothed readings",
     ErrorCause.CURRENTS: "recorded numbers",
     ErrorCause.PRIORS: "priors",
     ErrorCause.UNMODELLED: "not modelled",
@@ -34,6 +35,7 @@ REMEDIES = {
     ErrorCause.FIELD: "a new survey, or a drive while nothing near by changes",
     ErrorCause.WARP: "poses on the same point cloud for survey and drive",
     ErrorCause.CLOCK: "one clock for readings and poses",
+    ErrorCause.SMOOTHING: "readings without a low-pass filter",
     ErrorCause.CURRENTS: "a drive on which the recorded numbers change more",
     ErrorCause.PRIORS: "a drive that determines what now comes from priors",
     ErrorCause.UNMODELLED: "stated errors of poses and of the survey's sensors",
@@ -96,6 +98,7 @@ PARTS = {
     "height_m": (1e3, "{:.1f} mm of height"),
     "shift_m": (1e3, "{:.1f} mm"),
     "drift_s": (1e3, "{:.0f} ms from the start of the drive to its end"),
+    "smoothing_s": (1e3, "{:.0f} ms"),
     "walk_ut": (1.0, "{:.2g} µT from the start of the drive to its end"),
     "noise_ut": (1.0, "{:.2g} µT for a time"),
 }
@@ -107,6 +110,7 @@ CAUSES = {
     DisturbanceKind.FIELD: ErrorCause.FIELD,
     DisturbanceKind.WARP: ErrorCause.WARP,
     DisturbanceKind.CLOCK: ErrorCause.CLOCK,
+    DisturbanceKind.SMOOTHING: ErrorCause.SMOOTHING,
 }
 MATTERS = 0.1  # of a variance: what has less of it adds 5 % to a sigma at most
 
@@ -168,6 +172,12 @@ def disturbance_sentence(found: Disturbance) -> str:
                 f"The clock of {found.sensor} drifts against that of the poses by about {size}. "
                 "Sigmas hold it, and the time offset is that of the middle of the drive; stamp "
                 "readings and poses by one clock."
+            )
+        case DisturbanceKind.SMOOTHING:
+            return (
+                f"Readings of {found.sensor} are smoothed over about {size} against the poses, as "
+                "by a low-pass filter. Sigmas hold it, and the time offset is the filter's mean "
+                "delay; switch filters off, or drive more slowly."
             )
 
 

@@ -6,9 +6,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FieldSeries, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
+from l2m_gtsam.recording.sync import with_offsets
+from l2m_gtsam.simulate.hall_drives import CalibrationDrive
 from l2m_gtsam.studies.honesty.drives import drive_seed, driven, lasting
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
-from l2m_gtsam.studies.troubles.surveys import TroubledPlace
+from l2m_gtsam.studies.troubles.surveys import Place, TroubledPlace
 
 STRONG_UT = 50.0  # field of the Earth, at which a scale that is not linear is stated
 
@@ -22,6 +24,8 @@ def troubled_drive(
     """
     seed = drive_seed(place.truth.seed, number)
     drive = driven(place.truth.drive(options, seed))
+    if trouble.has(Trouble.SMOOTHED):
+        drive = smoothed(drive, place.truth, options.smoothed_s)
     rng, readings = np.random.default_rng([seed, 12]), drive.readings
     change, truth = np.zeros_like(readings.field), list(drive.sensors)
     for index in range(len(drive.sensors)):
@@ -52,6 +56,22 @@ def troubled_drive(
     )
     source = SourceFile(f"place-{place.truth.seed}-drive-{number}", "")
     return Recording(trajectory, series, source), tuple(truth)
+
+
+def smoothed(drive: CalibrationDrive, place: Place, constant_s: float) -> CalibrationDrive:
+    """Return a drive whose sensors have low-pass filters of first order, with a time constant."""
+    sensors, readings = drive.sensors, drive.readings
+    # Gauss-Laguerre: the integral over the past of exp(-s / constant), exact for cubes of s.
+    past, weight = np.polynomial.laguerre.laggauss(2)
+    change = np.zeros_like(readings.field)
+    for ago, share in ((0.0, -1.0), *zip(constant_s * past, weight, strict=True)):
+        then = with_offsets(readings, drive.trajectory, np.full(len(sensors), -ago))
+        for index, sensor in enumerate(sensors):
+            rows = readings.rows_of(index)
+            R, p = then.R_map_lidar[rows], then.p_map_lidar[rows]
+            b_lidar = np.einsum("nji,nj->ni", R, place.field(p + R @ sensor.t_lidar_mag))
+            change[rows] += share * b_lidar @ sensor.distortion.C.T
+    return replace(drive, readings=replace(readings, field=readings.field + change))
 
 
 def walk(

@@ -31,6 +31,8 @@ class Trouble(StrEnum):
     """Noise of the sensors that lasts, beside the white one."""
     NONLINEAR = "nonlinear"
     """Readings are off by a share of themselves that grows with them."""
+    SMOOTHED = "smoothed"
+    """The sensors have low-pass filters."""
     ALL = "all"
     """All that is not stated, together."""
 
@@ -94,6 +96,8 @@ class TroublesOptions(Options):
     """Standard deviation of pink noise in uT."""
     nonlinear: float = Field(default=0.002, gt=0)
     """Share by which a reading of 50 uT is off, along each axis."""
+    smoothed_s: float = Field(default=0.15, gt=0)
+    """Time constant of the filters in seconds, of first order."""
     map: MapOptions = MapOptions()
     """How the map is made of the survey, and of the structure that the LiDAR saw."""
 

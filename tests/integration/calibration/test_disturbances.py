@@ -116,3 +116,19 @@ def test_a_clock_that_drifts_is_sized_and_held() -> None:
     assert max(distances(found, truth)) < WITHIN
     assert found.result["mag_00"].unmodelled.largest == 1
     assert any("The clock of mag_00 drifts" in reason.text for reason in verdict.reasons)
+
+
+def test_a_low_pass_filter_is_sized_and_held() -> None:
+    found, truth, verdict = drive(Trouble.SMOOTHED)
+    filters = shown(Trouble.SMOOTHED, DisturbanceKind.SMOOTHING)
+    assert [each.sensor for each in filters] == ["mag_00", "mag_01"]
+    for each in filters:
+        # Turns begin and end within the filter's time: its higher moments make it look shorter.
+        assert 0.5 < each.sizes["smoothing_s"] / OPTIONS.smoothed_s < 1.2
+    for sensor in found.result.sensors:
+        offset = sensor.time_offset
+        assert offset is not None
+        # The filter's mean delay: to three sigmas, which include what the model leaves out.
+        assert abs(offset.seconds + OPTIONS.smoothed_s) < 3 * offset.sigma
+    assert max(distances(found, truth)) < WITHIN
+    assert any("Readings of mag_00 are smoothed" in reason.text for reason in verdict.reasons)

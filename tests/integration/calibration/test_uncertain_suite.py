@@ -47,7 +47,7 @@ def survey(seed: int, stated: bool = True) -> HarmonicMap:
         B, _ = WORLD.field_and_gradient(R[rows] @ truth.t_lidar_mag + p[rows])
         field[rows] = truth.distortion.apply(np.einsum("nji,nj->ni", R[rows], B))
     field += rng.normal(0, GIVEN.noise, field.shape)
-    still = LidarMotion(np.zeros((count, 6)), np.zeros(count))
+    still = LidarMotion.steady(np.zeros((count, 6)))
     read = Readings(("a", "b"), sensor, np.arange(count) * 10**8, R, p, field, motion=still)
     points, mapped = sensor_positions(read, ideal), map_fields(read, ideal)
     suite = suite_errors(read, ideal) if stated else None

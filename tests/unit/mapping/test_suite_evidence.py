@@ -31,7 +31,7 @@ def window(count: int = 40) -> SuiteWindow:
     field = np.einsum("nji,nj->ni", R, model.features(p) @ w)
     field += GIVEN.noise * rng.normal(size=field.shape)
     sensor = np.sort(np.arange(count) % SENSORS)
-    motion = LidarMotion(rng.normal(0, 0.5, (count, 6)), np.zeros(count))
+    motion = LidarMotion.steady(rng.normal(0, 0.5, (count, 6)))
     stamps = np.arange(count) * 50_000_000
     readings = Readings(("a", "b"), sensor, stamps, R, p, field, motion)
     return SuiteWindow(model, p.mean(axis=0), readings)

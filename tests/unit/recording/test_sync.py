@@ -1,5 +1,7 @@
 """Time association: interpolation, gaps, edges, thinning and the account of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -132,6 +134,21 @@ def test_other_offsets_are_other_poses() -> None:
     # The chord over a tenth of a second, seen from its middle.
     np.testing.assert_allclose(moved.motion.twist_lidar[:, :3], [[0, 0, 0.5]] * 100, atol=1e-7)
     np.testing.assert_allclose(moved.motion.twist_lidar[:, 3:], v, atol=1e-7)
+
+
+def test_accelerations_are_those_of_the_drive() -> None:
+    """A vehicle that becomes faster along x, and turns faster about z."""
+    steady, stamps = turning_drive(np.arange(0, 10, 0.1)), np.arange(1, 9, 0.1)
+    seconds = 1e-9 * (steady.stamp_ns - steady.stamp_ns[0])
+    R = Rotation.from_rotvec(np.outer(0.15 * seconds**2, [0, 0, 1.0])).as_matrix()
+    poses = replace(steady, R=R, p=np.outer(0.2 * seconds**2, [1.0, 0, 0]))
+    readings = synchronise(recording(poses, series(stamps)), KEEP_ALL).readings
+    assert readings.motion is not None
+    found = readings.motion.acceleration_lidar
+    np.testing.assert_allclose(found[:, :3], [[0, 0, 0.3]] * len(stamps), atol=1e-6)
+    expected = readings.R_map_lidar.transpose(0, 2, 1) @ [0.4, 0, 0]
+    # Stamps are whole nanoseconds: at 3.6 m/s, over 0.1 s twice.
+    np.testing.assert_allclose(found[:, 3:], expected, atol=1e-6)
 
 
 def test_beyond_its_poses_a_lidar_stands_still() -> None:

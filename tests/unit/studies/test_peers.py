@@ -55,7 +55,7 @@ def turning(seed: int, sensor: KnownSensor, rate: float = 20.0) -> ChipDrive:
         R,
         np.zeros((count, 3)),
         field + rng.normal(0, NOISE, field.shape),
-        LidarMotion(np.column_stack([turn_rate, np.zeros((count, 3))]), np.zeros(count)),
+        LidarMotion.steady(np.column_stack([turn_rate, np.zeros((count, 3))])),
     )
     return ChipDrive(readings, polar(sensor.distortion.C)[0])
 

@@ -146,7 +146,7 @@ def test_features_of_a_clock_are_how_the_field_goes_on() -> None:
     """Along the twist, by central differences, in a field whose gradient is the same all over."""
     rng, rows = np.random.default_rng(2), np.arange(40)
     twist = rng.standard_normal((len(ROWS), 6)) * np.repeat([0.5, 1.0], 3)
-    motion = LidarMotion(twist, np.zeros(len(ROWS)))
+    motion = LidarMotion.steady(twist)
     G, B = rng.standard_normal((3, 3)), np.array([20.0, 5.0, -40.0])
     R, t = READINGS.R_map_lidar, PLACES.t
 
@@ -177,7 +177,7 @@ def test_features_of_a_clock_are_how_the_field_goes_on() -> None:
 def test_a_clock_is_looked_for_where_the_lidar_moves() -> None:
     kinds = [each.kind for each in processes(PLACES, (0,))]
     assert DisturbanceKind.CLOCK not in kinds
-    motion = LidarMotion(np.ones((len(ROWS), 6)), np.zeros(len(ROWS)))
+    motion = LidarMotion.steady(np.ones((len(ROWS), 6)))
     moving = replace(PLACES, readings=replace(READINGS, motion=motion))
     clocks = [each for each in processes(moving, (0,)) if each.kind is DisturbanceKind.CLOCK]
     assert [each.sensor for each in clocks] == [0]
