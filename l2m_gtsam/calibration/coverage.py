@@ -82,11 +82,6 @@ class KnowsItself(Protocol):
         """How many times what it states its errors at these were, 1 at least."""
 
 
-def sigmas_hold(field_map: object) -> bool:
-    """Return whether nothing says that a map's errors are larger than it states."""
-    return errors_over_stated(field_map) <= 1
-
-
 def errors_over_stated(field_map: object) -> float:
     """Return how many times what it states a map's errors were, 1 where nothing is known of it."""
     return field_map.errors_over_stated if isinstance(field_map, KnowsItself) else 1.0

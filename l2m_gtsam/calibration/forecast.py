@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, fit_distortions, start_estimate
-from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
+from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution, joint_problem, sensor_solutions
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
@@ -166,6 +166,6 @@ def _uncertain(
     problem = UncertainProblem(drive, estimate, tests, options.factors)
     optimum = UncertainOptimum.at(problem, values)
     solved = optimum.solutions()
-    if options.warp_m > 0 and sigmas_hold(errors):
+    if options.warp_m > 0:
         return optimum.with_unseen(solved, optimum.foretold_warp(options.warp_m))
     return solved

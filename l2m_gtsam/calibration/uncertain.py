@@ -22,7 +22,7 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
 from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, Searched
-from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
+from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.joint_information import JointInformation
@@ -117,8 +117,7 @@ def solve_uncertain(
     found = settle_by_any(drive, near, tests, options, lambda done: progress(SEARCHED * done))
     # Processes would take up what is stated too small: it is judged without them.
     stated = found.optimum.stated(options.sensor_noise_ut)
-    # What a map leaves that does not know its own errors is no process of the drive.
-    searched = found.ending is not Ending.SINGULAR and sigmas_hold(errors)
+    searched = found.ending is not Ending.SINGULAR
     searched = searched and leave_noise(stated, found.estimate.noise[view.sensors])
     shown = found.optimum.searched() if searched else NOTHING_SEARCHED
     if shown.found:

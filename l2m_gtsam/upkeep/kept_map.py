@@ -9,7 +9,7 @@ from l2m_gtsam.calibration.averaged_rows import AveragedDrive, averaged, with_ca
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import vehicle_gain
 from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected
-from l2m_gtsam.calibration.coverage import sigmas_hold
+from l2m_gtsam.calibration.coverage import errors_over_stated
 from l2m_gtsam.calibration.drive_sources import drive_sources
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
@@ -84,7 +84,7 @@ def seen_sources(
     drive = AveragedDrive.of(averages, field_map, estimate)
     places = suspected(drive, field_map, options.averaging)
     # What a map misses that does not know its own errors is no change.
-    if not len(places) or not sigmas_hold(field_map):
+    if not len(places) or errors_over_stated(field_map) > 1:
         return SeenSources((), 0.0, 0.0)
     free = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
     rows = with_calibration(free, covariances(known))
