@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, fit_distortions, start_estimate
+from l2m_gtsam.calibration.budget.unseen_warp import foretold_warp
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution, joint_problem, sensor_solutions
@@ -167,5 +168,7 @@ def _uncertain(
     optimum = UncertainOptimum.at(problem, values)
     solved = optimum.solutions()
     if options.warp_m > 0:
-        return optimum.with_unseen(solved, optimum.foretold_warp(options.warp_m))
+        return optimum.with_unseen(
+            solved, foretold_warp(optimum.informed_of_warp(), options.warp_m)
+        )
     return solved

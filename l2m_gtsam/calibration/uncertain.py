@@ -21,7 +21,8 @@ import numpy as np
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
-from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, Searched
+from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, Searched, search
+from l2m_gtsam.calibration.budget.unseen_warp import unseen_warp
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
@@ -36,7 +37,7 @@ from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap, View
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.parallel.threads import side_by_side
-from l2m_gtsam.records.error_budget import StatedSize
+from l2m_gtsam.records.error_budget import DisturbanceKind, StatedSize
 from l2m_gtsam.solve.rank import Determinacy, RankOptions
 
 MAX_ROUNDS = 6
@@ -119,7 +120,8 @@ def solve_uncertain(
     stated = found.optimum.stated(options.sensor_noise_ut)
     searched = found.ending is not Ending.SINGULAR
     searched = searched and leave_noise(stated, found.estimate.noise[view.sensors])
-    shown = found.optimum.searched() if searched else NOTHING_SEARCHED
+    known = found.optimum.informed() if searched else None
+    shown = search(known) if known else NOTHING_SEARCHED
     if shown.found:
         moved = float(np.abs(found.estimate.t - near.t)[view.sensors].max())
         start = start_with(found, shown, field_map, errors, options, again=moved > REOBSERVE_M)
@@ -133,8 +135,9 @@ def solve_uncertain(
         )
     optimum = found.optimum
     solved, size = optimum.by_cause(optimum.solutions()), None
-    if searched and options.warp_m > 0 and found.drive.budget.warp is None:
-        unseen = optimum.unseen_warp(options.warp_m)
+    if known is not None and options.warp_m > 0 and found.drive.budget.warp is None:
+        of_warp = optimum.informed_of_warp() if shown.found else known.of_kind(DisturbanceKind.WARP)
+        unseen = unseen_warp(of_warp, options.warp_m)
         solved, size = optimum.with_unseen(solved, unseen), unseen.size_m
     scattered, halved = side_by_side(optimum.scattered, lambda: optimum.halved(solved))
     solved = optimum.wandering(optimum.robust(halved, scattered))

@@ -11,13 +11,8 @@ from l2m_factors import D, Q, U, W
 from l2m_gtsam.calibration.budget.found import spread_of_H
 from l2m_gtsam.calibration.budget.looked_for import processes
 from l2m_gtsam.calibration.budget.processes import Process, ReadingPlaces, Warp
-from l2m_gtsam.calibration.budget.search import (
-    ProcessInformation,
-    Searched,
-    process_information,
-    search,
-)
-from l2m_gtsam.calibration.budget.unseen_warp import UnseenWarp, foretold_warp, unseen_warp
+from l2m_gtsam.calibration.budget.search import ProcessInformation, process_information
+from l2m_gtsam.calibration.budget.unseen_warp import UnseenWarp
 from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.coverage import Coverage
 from l2m_gtsam.calibration.half_difference import (
@@ -114,17 +109,13 @@ class UncertainOptimum:
             )
         return tuple(solutions)
 
-    def searched(self) -> Searched:
-        """Return the processes that are not in the graph, and that its residuals show."""
-        return search(self._informed(processes(self._places, self._view.sensors)))
+    def informed(self) -> ProcessInformation:
+        """Return what residuals say of all processes that are looked for; none is in the graph."""
+        return self._informed(processes(self._places, self._view.sensors))
 
-    def unseen_warp(self, before_m: float) -> UnseenWarp:
-        """Return the bend of the frame that residuals leave possible; none is in the graph."""
-        return unseen_warp(self._informed([Warp.of(self._places)]), before_m)
-
-    def foretold_warp(self, before_m: float) -> UnseenWarp:
-        """Return that of a drive that is yet to be read."""
-        return foretold_warp(self._informed([Warp.of(self._places)]), before_m)
+    def informed_of_warp(self) -> ProcessInformation:
+        """Return what residuals say of a bend of the frame; none is in the graph."""
+        return self._informed([Warp.of(self._places)])
 
     def with_unseen(
         self, solved: Sequence[SensorSolution], unseen: UnseenWarp

@@ -1,7 +1,7 @@
 """Which processes a drive has, and how large: by the likelihood of what all else leaves."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
 
@@ -109,6 +109,19 @@ class ProcessInformation:
     def influence(self) -> FloatArray:
         """By how much a unit of each weight is off all variables of the graph, shape (n, M)."""
         return self._moved(self.across)
+
+    def of_kind(self, kind: DisturbanceKind) -> "ProcessInformation":
+        """Return the same of the processes of one kind alone."""
+        own = [k for k, each in enumerate(self.processes) if each.kind is kind]
+        at = np.concatenate([NO_WEIGHTS, *(self.columns[k] for k in own)])
+        ends = np.cumsum([len(self.columns[k]) for k in own])
+        return replace(
+            self,
+            processes=[self.processes[k] for k in own],
+            columns=np.split(np.arange(len(at)), ends[:-1]),
+            system=self.system.among(at),
+            across=self.across[:, at],
+        )
 
     def searched(self, found: Sequence[FoundProcess], noise: float) -> Searched:
         """Return processes with the weights that are most likely beside so much of the noise."""
