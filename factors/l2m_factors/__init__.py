@@ -16,7 +16,7 @@ from l2m_factors.key_pose_readings import (
     KeyPoseResiduals,
     key_pose_residuals,
 )
-from l2m_factors.keys import B, D, F, G, K, L, M, N, P, Q, S, T, U, V, W, X
+from l2m_factors.keys import A, B, D, F, G, K, L, M, N, P, Q, S, T, U, V, W, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
 from l2m_factors.pose import MapBatch, key_pose_factor
 from l2m_factors.priors import distance_prior, distortion_prior, held_directions, rotation_prior
@@ -48,6 +48,7 @@ from l2m_factors.tile_block import TileBlocks
 from l2m_factors.whitening import Whitening
 
 __all__ = [
+    "A",
     "B",
     "BatchedReadings",
     "Calibrations",

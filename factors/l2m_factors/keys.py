@@ -61,6 +61,11 @@ def L(sensor: int) -> int:
     return int(gtsam.symbol("L", sensor))
 
 
+def A(sensor: int) -> int:
+    """Return the key of how this sensor's H follows the vehicle's motion: Vector, unit variance."""
+    return int(gtsam.symbol("A", sensor))
+
+
 def B() -> int:
     """Return the key of how the field differs from the map's in time: Vector, unit variance."""
     return int(gtsam.symbol("B", 0))

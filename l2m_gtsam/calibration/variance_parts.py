@@ -32,6 +32,7 @@ BY_SYMBOL = {
     "F": ErrorCause.WARP,
     "K": ErrorCause.CLOCK,
     "L": ErrorCause.SMOOTHING,
+    "A": ErrorCause.MOVING_PARTS,
 }
 LEAST = 1e-3  # of a variance: less is not listed
 Parts = dict[ErrorCause, FloatArray]

@@ -29,6 +29,8 @@ class ErrorCause(StrEnum):
     """A clock that drifts against that of the poses."""
     SMOOTHING = "smoothing"
     """Readings that are means over some time."""
+    MOVING_PARTS = "moving parts"
+    """H that follows how the vehicle moves."""
     CURRENTS = "currents"
     """What recorded numbers add to the readings."""
     PRIORS = "priors"
@@ -71,6 +73,8 @@ class DisturbanceKind(StrEnum):
     """The time offset of a sensor is not constant."""
     SMOOTHING = "smoothing"
     """A sensor's readings are smoothed over some time, against the poses."""
+    MOVING_PARTS = "moving parts"
+    """H of a sensor follows how the vehicle moves: iron that steers, currents of motors."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,8 @@ class Disturbance:
         lidar's frame ``tilt_deg`` and ``floor_m`` (along x and y), ``heading_deg`` and
         ``height_m`` (along z); how long an error lasts, ``lasting_s``; ``shift_m``, of the
         floor's axes; ``drift_s``, of a clock from the start to the end of a drive;
-        ``smoothing_s``, of the time that a reading is a mean over.
+        ``smoothing_s``, of the time that a reading is a mean over; ``turning_ut``, ``speed_ut``
+        and ``acceleration_ut``, of an H that follows these, for a standard deviation of each.
     gain
         Twice the logarithm by which the drive is more likely with it.
     sensor

@@ -11,7 +11,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from l2m_factors import B, F, K, L, SharedError, W
+from l2m_factors import A, B, F, K, L, SharedError, W
 from l2m_gtsam.calibration.budget.processes import (
     LASTING_S,
     POSE_PARTS,
@@ -23,7 +23,12 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.error_budget import Disturbance, DisturbanceKind
 
 AXES = 3
-OF_A_SENSOR = {DisturbanceKind.WANDER: W, DisturbanceKind.CLOCK: K, DisturbanceKind.SMOOTHING: L}
+OF_A_SENSOR = {
+    DisturbanceKind.WANDER: W,
+    DisturbanceKind.CLOCK: K,
+    DisturbanceKind.SMOOTHING: L,
+    DisturbanceKind.MOVING_PARTS: A,
+}
 
 
 @dataclass(frozen=True)

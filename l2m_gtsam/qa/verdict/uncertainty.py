@@ -22,6 +22,7 @@ NAMES = {
     ErrorCause.WARP: "a bent frame",
     ErrorCause.CLOCK: "a clock that drifts",
     ErrorCause.SMOOTHING: "smoothed readings",
+    ErrorCause.MOVING_PARTS: "parts that move",
     ErrorCause.CURRENTS: "recorded numbers",
     ErrorCause.PRIORS: "priors",
     ErrorCause.UNMODELLED: "not modelled",
@@ -36,6 +37,7 @@ REMEDIES = {
     ErrorCause.WARP: "poses on the same point cloud for survey and drive",
     ErrorCause.CLOCK: "one clock for readings and poses",
     ErrorCause.SMOOTHING: "readings without a low-pass filter",
+    ErrorCause.MOVING_PARTS: "recorded steering and currents (`bag.regressors`)",
     ErrorCause.CURRENTS: "a drive on which the recorded numbers change more",
     ErrorCause.PRIORS: "a drive that determines what now comes from priors",
     ErrorCause.UNMODELLED: "stated errors of poses and of the survey's sensors",
@@ -99,6 +101,9 @@ PARTS = {
     "shift_m": (1e3, "{:.1f} mm"),
     "drift_s": (1e3, "{:.0f} ms from the start of the drive to its end"),
     "smoothing_s": (1e3, "{:.0f} ms"),
+    "turning_ut": (1.0, "{:.2g} µT with its turns"),
+    "speed_ut": (1.0, "{:.2g} µT with its speed"),
+    "acceleration_ut": (1.0, "{:.2g} µT with its acceleration"),
     "walk_ut": (1.0, "{:.2g} µT from the start of the drive to its end"),
     "noise_ut": (1.0, "{:.2g} µT for a time"),
 }
@@ -111,6 +116,7 @@ CAUSES = {
     DisturbanceKind.WARP: ErrorCause.WARP,
     DisturbanceKind.CLOCK: ErrorCause.CLOCK,
     DisturbanceKind.SMOOTHING: ErrorCause.SMOOTHING,
+    DisturbanceKind.MOVING_PARTS: ErrorCause.MOVING_PARTS,
 }
 MATTERS = 0.1  # of a variance: what has less of it adds 5 % to a sigma at most
 
@@ -178,6 +184,12 @@ def disturbance_sentence(found: Disturbance) -> str:
                 f"Readings of {found.sensor} are smoothed over about {size} against the poses, as "
                 "by a low-pass filter. Sigmas hold it, and the time offset is the filter's mean "
                 "delay; switch filters off, or drive more slowly."
+            )
+        case DisturbanceKind.MOVING_PARTS:
+            return (
+                f"H of {found.sensor} follows how the vehicle moves: by {size}. Sigmas hold it. "
+                "Iron steers near it, or motors draw currents: record these and name them "
+                "(bag.regressors), or mount it further away."
             )
 
 
