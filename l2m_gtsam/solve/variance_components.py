@@ -213,7 +213,9 @@ class WeightSystem:
         """Return the same where the noise has this share of its variance only."""
         return WeightSystem(self.information / noise, self.pull / noise)
 
-    def components_and_noise(self, spectra: FloatArray, squares: float) -> VarianceComponents:
+    def components_and_noise(
+        self, spectra: FloatArray, squares: float, chance: FloatArray | float = 0.0
+    ) -> VarianceComponents:
         """Return the most likely sizes where what they explain is no noise.
 
         Parameters
@@ -222,13 +224,16 @@ class WeightSystem:
             Of K processes, shape (K, m).
         squares
             Sum of squares of all residuals, white by a noise that has all of that in it.
+        chance
+            Pull that is expected of such a noise without any weight, shape (m,).
         """
         noise = 1.0
         for _ in range(ROUNDS):
-            system = self.whiter(noise)
+            beyond = replace(self, pull=self.pull - noise * chance)
+            system = beyond.whiter(noise)
             found = replace(system.components(spectra), noise=noise)
             variances = found.sizes @ spectra
-            explained = self.pull @ (variances * system.fit(variances).rest)
+            explained = beyond.pull @ (variances * system.fit(variances).rest)
             noise = max(1 - float(explained) / squares, LEAST_NOISE)
         return found
 

@@ -15,8 +15,8 @@ joint posterior.
 
 Only C and H as they differ between sensors, and H as it shows under several headings, are
 corrected: the projection :math:`\Pi`. Any prior of a field finds a common C that makes the field
-smaller more likely, and waves that a map misses between two heights look like errors of the places.
-These keep their covariance and are considered (Schmidt 1966).
+smaller more likely, and exact sensors pull at their places, too (see ``suite_sizes``). These keep
+their covariance and are considered (Schmidt 1966).
 """
 
 from dataclasses import replace

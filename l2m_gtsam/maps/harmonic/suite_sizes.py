@@ -9,6 +9,17 @@ a tile's posterior mean, and E what a unit of each error does to the readings,
 are the information and the pull of the errors with the field taken out. All places, all entries of
 C, all H and all time offsets have a size each, the most likely one.
 
+Exact sensors pull, too: E holds the gradient of a posterior that was made of these very readings.
+By the derivative of the determinant in the marginal likelihood, with the posterior's covariances,
+
+.. math::
+    \langle u_k \rangle = -\sum_n \frac{w_n}{\sigma^2} \sum_i
+        \mathrm{cov}(\partial B_i, B_i)(x_n) \cdot dx_{nk}
+        = -\sum_n \frac{w_n}{2 \sigma^2} \nabla \mathrm{var}(x_n) \cdot dx_{nk}
+
+The variance falls with height above a floor of steel: without this, sensors at different heights
+look misplaced by up to a centimetre.
+
 What all sensors have in common says nothing of that. A shift of all is one of the map; and a common
 C makes the field smaller, which any prior of a field finds more likely. Sizes are therefore those
 of the sensors' differences, and of H as it shows under several headings.
@@ -77,11 +88,14 @@ class TileView:
     ----------
     system
         Information and pull of all of them.
+    chance
+        Pull that is expected of exact sensors, shape (k,).
     squares
         Sum of squares of the residuals, white by the map's noise.
     """
 
     system: WeightSystem
+    chance: FloatArray
     squares: float
 
 
@@ -99,7 +113,7 @@ def suite_sizes(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> SuiteSizes 
     spectra = (part == np.arange(len(NAMES))[:, None]).astype(np.float64)
     view = survey_view(learnt, tiles, suite, turned)
     # The map's noise has these errors in it: what they explain is none.
-    found = view.system.components_and_noise(spectra, view.squares)
+    found = view.system.components_and_noise(spectra, view.squares, view.chance)
     if found.gain < LEAST_GAIN:
         return None
     return SuiteSizes(*np.sqrt(found.sizes).tolist())
@@ -108,8 +122,7 @@ def suite_sizes(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> SuiteSizes 
 def stated_size(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> StatedSize | None:
     """Return how large errors of C and H are beside what was stated of them, all alike.
 
-    Places of sensors are not judged: millimetres hardly show, and waves that a map misses between
-    the heights of two sensors look like them.
+    Places of sensors are not judged: millimetres hardly show.
 
     Parameters
     ----------
@@ -199,8 +212,9 @@ def survey_view(learnt: Learnt, tiles: Tiles, suite: SuiteErrors, turned: FloatA
     seen = in_threads(lambda index: tile_view(learnt, tiles, suite, index), some)
     information = np.sum([each.system.information for each in seen], axis=0)
     pull = np.sum([each.system.pull for each in seen], axis=0)
+    chance = np.sum([each.chance for each in seen], axis=0)
     system = WeightSystem(turned.T @ information @ turned, turned.T @ pull)
-    return TileView(system, sum(each.squares for each in seen))
+    return TileView(system, turned.T @ chance, sum(each.squares for each in seen))
 
 
 def differences(sensors: int) -> tuple[FloatArray, IntArray]:
@@ -234,7 +248,9 @@ def tile_view(learnt: Learnt, tiles: Tiles, suite: SuiteErrors, index: int) -> T
     information = weighted.T @ left.reshape(len(weighted), -1)
     residual = readings.field - field
     system = WeightSystem(0.5 * (information + information.T), weighted.T @ residual.ravel())
-    return TileView(system, float(weight @ (residual**2).sum(axis=1)))
+    together = tile.gradient_beside_field(readings.points)
+    chance = np.einsum("n,nik->k", weight, suite.of_field(rows, gradient + together) - wrong)
+    return TileView(system, chance, float(weight @ (residual**2).sum(axis=1)))
 
 
 def sized(suite: SuiteErrors, sizes: SuiteSizes) -> SuiteErrors:

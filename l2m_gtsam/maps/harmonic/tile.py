@@ -14,6 +14,7 @@ from l2m_gtsam.maps.harmonic.modes import left_out
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 
 NEAREST = 0.9  # of the distance from the lowest (highest) reading to the sheet of sources
+STEP = 1e-3  # metres, of differences: fields vary over decimetres
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,26 @@ class Tile:
             root = self.root_rows(points[at])
             variance[at] = np.einsum("min,min->ni", root, root)
         return variance + self.unresolved(points)
+
+    def gradient_beside_field(self, points: FloatArray) -> FloatArray:
+        """Return the covariance of the errors of each component and of its gradient, uT^2/m.
+
+        That is half of the slope of the component's variance.
+
+        Returns
+        -------
+        FloatArray
+            By component and direction of the derivative, map frame, shape (N, 3, 3).
+        """
+        covariance, ones = np.empty((len(points), 3, 3)), np.ones(len(self.basis))
+        for at in batches(len(points)):
+            inside = self.within(points[at])
+            root = self.weights.root_rows(self.basis, inside)
+            with_field = self.unwhitened(root.reshape(len(root), -1)).reshape(root.shape)
+            for axis, step in enumerate(STEP * np.eye(3)):
+                rise = self.basis.rows(inside + step, ones) - self.basis.rows(inside - step, ones)
+                covariance[at, :, axis] = np.einsum("min,min->ni", with_field, rise) / (2 * STEP)
+        return covariance
 
     def unresolved(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis that the modes left out hold, uT^2, shape (N, 3)."""
