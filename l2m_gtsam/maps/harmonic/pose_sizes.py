@@ -177,33 +177,41 @@ def likely(views: Sequence[PoseView], parts: IntArray, *, known: bool) -> Varian
 
 def pose_view(learnt: Learnt, tiles: Tiles, poses: SurveyPoses, index: int) -> PoseView:
     """Return what the readings in the middle of a tile say."""
-    tile, rows = tiles[index], learnt.members[index]
-    away = np.linalg.norm(
-        learnt.readings.points[rows, :2] - learnt.tiling.grid.centres[index], axis=1
-    )
-    rows = np.sort(rows[np.argsort(away)[:MOST_READINGS]])
-    readings = learnt.readings[rows]
+    tile, own = tiles[index], middle(learnt, index)
+    # The tile holds what errors of the sensors do to all of its readings.
+    rows = own if learnt.suite is None else learnt.members[index]
+    at, readings = np.searchsorted(rows, own), learnt.readings[rows]
     field, gradient = tile.field_and_gradient(readings.points)
-    effects = poses.knots(rows, gradient)
-    errors, part = effects.white, PARTS[effects.part]
-    count = errors.shape[2]
+    effects = poses.knots(own, gradient[at])
+    part, count = PARTS[effects.part], len(effects.part)
+    errors = np.zeros((len(rows), 3, count))
+    errors[at] = effects.white
+    by_unit = np.square(errors[at]).mean(axis=(0, 1))
     if learnt.suite is not None:  # those of the sensors explain what they can
         root = suite_root(learnt.suite)
         errors = np.concatenate([errors, learnt.suite.of_field(rows, gradient) @ root], axis=2)
     root_weight = np.sqrt(readings.weight)[:, None, None] / tile.hyperparameters.noise
     E = (errors * root_weight).reshape(-1, errors.shape[2])
     F = (tile.basis.features(readings.points) * root_weight).reshape(len(E), -1)
-    r = ((readings.field - field)[:, :, None] * root_weight).ravel()
+    r = (readings.field - field)[:, :, None] * root_weight
     white = np.ascontiguousarray((F.T @ E) * tile.weights.prior_sigma[:, None])
     tile.weights.factor.solve_rows(white)
     information = E.T @ E - white.T @ white
-    system = WeightSystem(0.5 * (information + information.T), E.T @ r)
+    system = WeightSystem(0.5 * (information + information.T), E.T @ r.ravel())
     beside = np.arange(len(information)) >= count
     if beside.any():
         system = system.beside(beside.astype(float)).among(np.arange(count))
-    by_unit = np.square(errors[:, :, :count]).mean(axis=(0, 1))
     by_part = np.array([by_unit[part == each].sum() for each in np.unique(PARTS)])
-    return PoseView(system, part, float(r @ r), by_part)
+    return PoseView(system, part, float(np.square(r[at]).sum()), by_part)
+
+
+def middle(learnt: Learnt, index: int) -> IntArray:
+    """Return the readings nearest to the middle of a tile, sorted."""
+    rows = learnt.members[index]
+    away = np.linalg.norm(
+        learnt.readings.points[rows, :2] - learnt.tiling.grid.centres[index], axis=1
+    )
+    return np.sort(rows[np.argsort(away)[:MOST_READINGS]])
 
 
 TURNS = 2  # of sizes, then scales

@@ -14,12 +14,15 @@ from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic.evidence import condition, evidence, normal_of
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
+from l2m_gtsam.maps.harmonic.pose_sizes import MOST_READINGS, pose_view
 from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 from l2m_gtsam.maps.harmonic.tile_correlation import shared_poses, within_whole
+from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.reading_errors import errors_together
+from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.maps.survey_poses import KNOTS, SurveyPoses
-from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.maps.training import TrainingSet, cubes_of
 from tests.worlds.exact import DipoleWorld, dipole_world
 from tests.worlds.harmonic import GIVEN, basis, places, rms
 
@@ -206,6 +209,40 @@ def test_poses_that_are_exact_are_not_found_wrong(world: DipoleWorld) -> None:
     ours = HarmonicMap.fit(seen.points, seen.field, NO_SEARCH, None, None, seen.poses)
     assert ours.learnt.poses is None
     assert ours.summary.doubts == HarmonicMap.fit(seen.points, seen.field, NO_SEARCH).summary.doubts
+
+
+def test_errors_of_sensors_are_no_errors_of_poses(world: DipoleWorld) -> None:
+    """Two sensors, each on every other lane, are off by H: poses explain nothing of it.
+
+    The tile holds what H did to all of its readings, and a view has only those in its middle.
+    """
+    seen = survey(world, 0.0)
+    options = NO_SEARCH.model_copy(update={"hyperparameters": GIVEN})
+    learnt = HarmonicMap.fit(seen.points, seen.field, options).learnt
+    owner, weight = cubes_of(seen.points, options.merge), np.ones(len(seen.points))
+    index = int(np.argmax([len(rows) for rows in learnt.members]))
+    assert len(learnt.members[index]) > 1.5 * MOST_READINGS
+    shift = np.zeros((len(owner), SHIFT, SIZE))
+    shift[:, 3:, 12:15] = np.eye(3)
+    covariance = np.diag(np.tile(np.where(shift[0].any(axis=0), 10.0**2, 0.0), 2))
+    sensor, every = seen.poses.drive % 2, np.arange(len(owner))
+    suite = SuiteErrors(("s0", "s1"), covariance, every, sensor, shift)
+    suite = suite.averaged(owner, weight)
+    turns = seen.poses.shift.copy()
+    turns[:, :3] = 0.0
+    poses = replace(seen.poses, shift=turns).averaged(owner, weight)
+    rows = np.arange(len(learnt.readings))
+    effect = suite.of_field(rows, np.zeros((len(rows), 3, 3)))
+    off = effect @ np.repeat([1.0, -1.0], SIZE)
+
+    def pull(field: FloatArray) -> FloatArray:
+        read = replace(learnt, readings=replace(learnt.readings, field=field), suite=suite)
+        view = pose_view(read, Tiles(read), poses, index)
+        system = view.among(np.array([0, 1])).system  # tilt and heading
+        return np.asarray(system.pull / np.sqrt(np.diag(system.information)))
+
+    moved = pull(learnt.readings.field + off) - pull(learnt.readings.field)
+    assert np.abs(moved).max() < 0.05
 
 
 @pytest.mark.parametrize("tilt", [TILT, 0.0])
