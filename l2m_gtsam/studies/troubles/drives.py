@@ -5,7 +5,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FieldSeries, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
+from l2m_gtsam.data import (
+    FieldSeries,
+    FloatArray,
+    KnownSensor,
+    Readings,
+    Recording,
+    SourceFile,
+    Trajectory,
+)
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive
 from l2m_gtsam.studies.honesty.drives import drive_seed, driven, lasting
@@ -33,6 +41,8 @@ def troubled_drive(
         seconds = 1e-9 * (readings.stamp_ns[rows] - readings.stamp_ns[rows.start])
         walked = walk(options, trouble, seconds, rng)
         change[rows] = walked + noise_that_lasts(options, trouble, len(seconds), rng)
+        if trouble.has(Trouble.STEERING):
+            change[rows] += steered(options, readings[np.arange(rows.start, rows.stop)], rng)
         if trouble.has(Trouble.NONLINEAR):
             bent_scale = not_linear(options, readings.field[rows], rng)
             change[rows] += bent_scale
@@ -92,6 +102,17 @@ def noise_that_lasts(
     if not trouble.has(Trouble.PINK):
         return np.zeros((count, 3))
     return options.pink_ut * pink(count, rng)
+
+
+def steered(options: TroublesOptions, readings: Readings, rng: np.random.Generator) -> FloatArray:
+    """Return the field of iron that moves with the steering at a sensor's readings, uT, (N, 3)."""
+    if readings.motion is None:
+        raise ValueError("readings without motion: nothing steers")
+    upright = readings.R_map_lidar[:, 2]
+    turning = np.einsum("ni,ni->n", upright, readings.motion.twist_lidar[:, :3])
+    angle = np.clip(turning / options.steering_rad_s, -1.0, 1.0)
+    field = options.steering_ut / np.sqrt(3) * rng.standard_normal(3)
+    return np.asarray(angle[:, None] * field)
 
 
 def with_offset(sensor: KnownSensor, change: FloatArray) -> KnownSensor:

@@ -33,6 +33,8 @@ class Trouble(StrEnum):
     """Readings are off by a share of themselves that grows with them."""
     SMOOTHED = "smoothed"
     """The sensors have low-pass filters."""
+    STEERING = "steering"
+    """Iron near the sensors moves with the steering."""
     ALL = "all"
     """All that is not stated, together."""
 
@@ -98,6 +100,11 @@ class TroublesOptions(Options):
     """Share by which a reading of 50 uT is off, along each axis."""
     smoothed_s: float = Field(default=0.15, gt=0)
     """Time constant of the filters in seconds, of first order."""
+    steering_ut: float = Field(default=1.0, gt=0)
+    """Field of the iron in uT where a vehicle turns by `steering_rad_s`, standard deviation of its
+    length."""
+    steering_rad_s: float = Field(default=0.5, gt=0)
+    """Rate of turn at which the steering is at its stop."""
     map: MapOptions = MapOptions()
     """How the map is made of the survey, and of the structure that the LiDAR saw."""
 

@@ -132,3 +132,14 @@ def test_a_low_pass_filter_is_sized_and_held() -> None:
         assert abs(offset.seconds + OPTIONS.smoothed_s) < 3 * offset.sigma
     assert max(distances(found, truth)) < WITHIN
     assert any("Readings of mag_00 are smoothed" in reason.text for reason in verdict.reasons)
+
+
+def test_iron_that_steers_is_found_and_held() -> None:
+    found, truth, verdict = drive(Trouble.STEERING)
+    moving = shown(Trouble.STEERING, DisturbanceKind.MOVING_PARTS)
+    assert [each.sensor for each in moving] == ["mag_00", "mag_01"]
+    for each in moving:
+        assert each.sizes["turning_ut"] > 5 * each.sizes["acceleration_ut"]
+    assert max(distances(found, truth)) < WITHIN
+    assert verdict.level is Level.WARN
+    assert any("H of mag_00 follows how the vehicle" in each.text for each in verdict.reasons)
