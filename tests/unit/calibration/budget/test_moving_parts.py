@@ -29,13 +29,9 @@ def motion(seed: int) -> LidarMotion:
 def test_numbers_do_not_depend_on_how_the_lidar_is_mounted() -> None:
     R, moving = PLACES.readings.R_map_lidar, motion(1)
     mount = Rotation.from_euler("xyz", [20, -70, 130], degrees=True).as_matrix()
-    turned = LidarMotion(
-        *(
-            np.hstack([each[:, :3] @ mount, each[:, 3:] @ mount])
-            for each in (moving.twist_lidar, moving.acceleration_lidar)
-        ),
-        moving.offset,
-    )
+    both = np.kron(np.eye(2), mount)
+    twist, growth = moving.twist_lidar @ both, moving.acceleration_lidar @ both
+    turned = LidarMotion(twist, growth, moving.offset)
     np.testing.assert_allclose(
         motion_numbers(R @ mount, turned), motion_numbers(R, moving), atol=1e-12
     )
@@ -74,9 +70,8 @@ def test_what_does_not_vary_adds_nothing() -> None:
 
 def test_other_readings_have_the_units_of_the_drive() -> None:
     readings = replace(PLACES.readings, motion=motion(3))
-    every = MovingParts(
-        replace(PLACES, readings=readings), 0, VehicleMotion.over(readings, motion(3))
-    )
+    vehicle = VehicleMotion.over(readings, motion(3))
+    every = MovingParts(replace(PLACES, readings=readings), 0, vehicle)
     part = np.arange(10, 25)
     few = scene(np.linspace(0.0, 30.0, COUNT))
     few = replace(few, readings=readings[part], C=few.C[part])
