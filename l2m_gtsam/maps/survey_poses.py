@@ -15,7 +15,6 @@ from scipy.linalg import cholesky
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 
 POSE = 6  # rotation about and translation along the axes of the map
-SHIFT = 6  # of a reading: its position, then its field
 KNOTS = 2  # for as long as an error lasts
 MOST_KNOTS = 160  # of one tile: then they lie further apart
 ROUNDING = 1e-10

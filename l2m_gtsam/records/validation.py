@@ -29,16 +29,6 @@ class CalibrationPart(StrEnum):
     CLOCK = "clock"
 
 
-UNITS = {
-    CalibrationPart.PLACE: "m",
-    CalibrationPart.ROTATION: "deg",
-    CalibrationPart.GAINS: "1",
-    CalibrationPart.ANGLES: "deg",
-    CalibrationPart.OFFSET: "uT",
-    CalibrationPart.CLOCK: "s",
-}
-
-
 @dataclass(frozen=True)
 class FieldError(Record):
     """Readings less the map's field, along the axes of the lidar.

@@ -161,33 +161,10 @@ def _path(hall: SteelHall, rng: np.random.Generator, count: int) -> Path:
     curve = xy.sum(axis=2)
     low, high = curve.min(axis=0), curve.max(axis=0)
     curve = (2 * (curve - low) / (high - low) - 1) * (HALF_AREA - 0.3)
-    return _driven(hall, curve)
+    return driven(hall, curve)
 
 
-def patrol(hall: SteelHall, seed: int, lane: float = LANE_M, step: float = 0.1) -> Trajectory:
-    """Return poses of a vehicle that goes through the whole area in lanes, there and back.
-
-    Parameters
-    ----------
-    hall, seed
-        Where, and what is random: along which axis, and where the lanes lie.
-    lane, step
-        From lane to lane and from pose to pose in metres.
-    """
-    rng = np.random.default_rng([seed, 7])
-    along = int(rng.integers(2))
-    reach = HALF_AREA - 0.1
-    across = np.arange(-reach[1 - along] + rng.uniform(0, lane / 2), reach[1 - along], lane)
-    s = np.linspace(-reach[along], reach[along], round(2 * reach[along] / step))
-    curve = np.empty((len(across), len(s), 2))
-    curve[:, :, along] = s
-    curve[1::2, :, along] = s[::-1]
-    curve[:, :, 1 - along] = across[:, None]
-    path = _driven(hall, curve.reshape(-1, 2))
-    return Trajectory(STEP_NS * np.arange(len(path.p)), path.R, path.p, "map", "lidar")
-
-
-def _driven(hall: SteelHall, curve: FloatArray) -> Path:
+def driven(hall: SteelHall, curve: FloatArray) -> Path:
     """Return poses along a curve, (N, 2), that bends around structures, heading along it."""
     curve = hall.pushed(curve, BODY_M)
     ahead = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)

@@ -6,7 +6,7 @@ not: weights, truncation, ridge.
 1. Rows are weighted and centred with the weighted means, so that H follows from the means and is
    never penalised (mixed LS-TLS; the paper omits the intercept).
 2. TLS truncates the compound matrix [b_lidar b_meas] to rank 3 (paper, section III-C).
-3. The ridge pulls C towards C0: ``lambda ||C - C0||_F^2`` (the paper penalises the data).
+3. The ridge pulls C towards the identity: ``lambda ||C - I||_F^2`` (the paper penalises the data).
 
 Everything after step 1 works on the 6 x 6 triangular factor of the compound matrix.
 """
@@ -187,7 +187,6 @@ def fit_distortion(
     b_meas: FloatArray,
     weights: FloatArray,
     options: ClosedFormOptions,
-    C0: FloatArray | None = None,
 ) -> DistortionFit:
     """Solve ``b_meas = C b_lidar + H``.
 
@@ -201,8 +200,6 @@ def fit_distortion(
         Weight of each reading's squared residual, shape (N,); used by `w_rrtls` only.
     options
         Method, weighting and ridge.
-    C0
-        Where the ridge pulls to, and where directions without any data stay; identity by default.
 
     Raises
     ------
@@ -215,7 +212,6 @@ def fit_distortion(
             f"at least {MIN_READINGS} are needed"
         )
         raise CalibrationError(msg)
-    C0 = np.eye(3) if C0 is None else C0
     method = options.method
     w = weights if method is Method.W_RRTLS else np.ones(len(b_lidar))
     # H is the intercept: centring eliminates it exactly, without truncation or ridge (mixed LS-TLS,
@@ -225,12 +221,12 @@ def fit_distortion(
     # R has the singular values, right singular vectors and normal equations of all N rows.
     factor = np.asarray(np.linalg.qr(rows, mode="r"))
     kept = factor if method is Method.OLS else _truncated(factor)
-    # The unknown is C - C0, so that the ridge and the smallest solution lead to C0, not to zero.
-    X, Y = kept[:, :3], kept[:, 3:] - kept[:, :3] @ C0.T
+    # The unknown is C - I: the ridge and the smallest solution lead to the identity, not to zero.
+    X, Y = kept[:, :3], kept[:, 3:] - kept[:, :3]
     ridge = 0.0
     if method in (Method.RRTLS, Method.W_RRTLS):
         ridge = _ridge(X, Y, float(np.sum((factor - kept) ** 2)), len(rows), options)
-    C = C0 + _solve_ridge(X, Y, ridge * _unit(X)).T
+    C = np.eye(3) + _solve_ridge(X, Y, ridge * _unit(X)).T
     return DistortionFit(Distortion(C, mean_m - C @ mean_l), ridge)
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from l2m_gtsam.storage.bag_options import ColumnOptions, TimeUnit
 from l2m_gtsam.storage.units import Unit
 
-AXES = {"x": "xyz", "0": "012"}
 # Endings of names, in brackets or after an underscore.
 FIELD_UNITS = {
     "t": Unit.TESLA,

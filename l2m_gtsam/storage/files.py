@@ -20,7 +20,7 @@ MAX_TEXT_BYTES = 500_000_000  # a day of poses at 50 Hz
 
 
 @contextmanager
-def open_text(path: Path, error: type[L2MError], most: int = MAX_TEXT_BYTES) -> Iterator[TextIO]:
+def open_text(path: Path, error: type[L2MError]) -> Iterator[TextIO]:
     """Open a text of others for reading, line by line.
 
     Parameters
@@ -29,12 +29,10 @@ def open_text(path: Path, error: type[L2MError], most: int = MAX_TEXT_BYTES) -> 
         A regular file in UTF-8.
     error
         What to raise, with one line that names the file, if it cannot be read.
-    most
-        Bytes that are accepted.
     """
     with opened(path, error) as file:
-        if os.fstat(file.fileno()).st_size > most:
-            raise error(f"{path}: larger than {most // 1_000_000} MB; give a shorter one")
+        if os.fstat(file.fileno()).st_size > MAX_TEXT_BYTES:
+            raise error(f"{path}: larger than {MAX_TEXT_BYTES // 1_000_000} MB; give a shorter one")
         try:
             yield TextIOWrapper(file, encoding="utf-8-sig", newline="")
         except UnicodeDecodeError as reason:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2, norm, t
 
-from l2m_gtsam.data import FieldSample, FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray
 
 LEVEL = 0.95
 
@@ -48,29 +48,15 @@ class ClusteredMean:
     effective: float
     groups: int
 
-    def band(self, level: float = LEVEL) -> Band:
-        """Return Student's interval of the true mean."""
-        reach = float(t.ppf(0.5 + level / 2, self.groups - 1)) * self.standard_error
+    def band(self) -> Band:
+        """Return Student's 95 % interval of the true mean."""
+        reach = float(t.ppf(0.5 + LEVEL / 2, self.groups - 1)) * self.standard_error
         return Band(self.mean - reach, self.mean + reach)
 
 
-def z_scores(sample: FieldSample, truth: FloatArray) -> FloatArray:
-    """Return (map - truth) / sigma per axis at the points inside the map, shape (M, 3).
-
-    ``truth``, shape (N, 3), is the field without noise: a sample's variance has none.
-    """
-    z = (sample.field - truth) / np.sqrt(sample.variance)
-    return np.asarray(z[sample.inside])
-
-
-def inside_interval(z: FloatArray, level: float = LEVEL) -> FloatArray:
-    """Return which z-scores of any shape lie within the central interval of a level, 0 or 1."""
-    return np.asarray(np.abs(z) <= norm.ppf(0.5 + level / 2), dtype=np.float64)
-
-
-def interval_coverage(z: FloatArray, level: float = LEVEL) -> float:
-    """Return the share of z-scores of any shape within the central interval of a level."""
-    return float(np.mean(inside_interval(z, level)))
+def inside_interval(z: FloatArray) -> FloatArray:
+    """Return which z-scores of any shape lie within the central 95 % interval, 0 or 1."""
+    return np.asarray(np.abs(z) <= norm.ppf(0.5 + LEVEL / 2), dtype=np.float64)
 
 
 def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -102,9 +88,9 @@ def chi_square_band(dof: int, count: float, level: float = LEVEL) -> Band:
     return Band(low / count, high / count)
 
 
-def ellipsoid_coverage(values: FloatArray, dof: int, level: float = LEVEL) -> FloatArray:
-    """Return which NEES of ``dof`` dimensions lie within the ellipsoid of a level, 0 or 1."""
-    return (values <= chi2.ppf(level, dof)).astype(np.float64)
+def ellipsoid_coverage(values: FloatArray, dof: int) -> FloatArray:
+    """Return which NEES of ``dof`` dimensions lie within the 95 % ellipsoid, 0 or 1."""
+    return (values <= chi2.ppf(LEVEL, dof)).astype(np.float64)
 
 
 def wilson_interval(share: float, count: float, level: float = LEVEL) -> Band:

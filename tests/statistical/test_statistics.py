@@ -11,11 +11,11 @@ from l2m_gtsam.studies.statistics import (
     chi_square_band,
     clustered_mean,
     ellipsoid_coverage,
-    interval_coverage,
+    inside_interval,
     nees,
     wilson_interval,
-    z_scores,
 )
+from tests.worlds.studied_maps import z_scores
 
 COUNT = 4000
 # Probability that a true covariance fails a test here by chance, per seed: the seeds are fixed.
@@ -84,10 +84,10 @@ def test_z_scores_count_points_inside_alone() -> None:
     sample = FieldSample(field, np.zeros((COUNT, 3, 3)), variance, inside)
     z = z_scores(sample, truth)
     assert z.shape == (inside.sum(), 3)
-    assert 0.95 in wilson_interval(interval_coverage(z), z.size, LEVEL)
+    assert 0.95 in wilson_interval(inside_interval(z).mean(), z.size, LEVEL)
     assert z.size * z.std() ** 2 == pytest.approx(z.size, abs=4 * np.sqrt(2 * z.size))
     # Sigmas a tenth too small are told from true ones by 10,800 scores.
-    assert 0.95 not in wilson_interval(interval_coverage(z / 0.9), z.size, LEVEL)
+    assert 0.95 not in wilson_interval(inside_interval(z / 0.9).mean(), z.size, LEVEL)
 
 
 def shared_draws(seed: int, surveys: int, drives: int, share: float) -> FloatArray:

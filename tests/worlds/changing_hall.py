@@ -5,12 +5,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_gtsam.calibration.changed_places import ChangesOptions
-from l2m_gtsam.data import FloatArray, KnownSensor, Recording
+from l2m_gtsam.data import FloatArray, KnownSensor, Recording, Trajectory
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.simulate.hall_drives import calibration_drive, patrol, survey
-from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
+from l2m_gtsam.simulate.hall_drives import (
+    LANE_M,
+    STEP_NS,
+    calibration_drive,
+    driven,
+    survey,
+)
+from l2m_gtsam.simulate.steel_hall import (
+    HALF_AREA,
+    CloudVariant,
+    SteelHall,
+    hall_cloud,
+    steel_hall,
+)
 from l2m_gtsam.studies.changes.loads import (
     ChangesStudyOptions,
     Loads,
@@ -27,6 +39,7 @@ OUTSIDE = 8  # places for loads beyond the area, besides those on timber
 STANDING = 3  # of so many places one has a load when the hall is surveyed
 MOST_EVENTS = 3  # of a round
 JUDGED_HEIGHTS, JUDGED = (0.45, 0.6, 0.8, 0.95), 400  # between the survey's; places at each
+STEP_M = 0.1  # from pose to pose
 FRESH = 500  # a survey's seed over that of the hall
 
 
@@ -130,6 +143,24 @@ class Warehouse:
         e = (known.field - hall.world.field(points))[known.inside]
         z = e / np.sqrt(known.variance[known.inside])
         return MapScore(float(np.sqrt(np.mean(e**2))), float(np.sqrt(np.mean(z**2))))
+
+
+def patrol(hall: SteelHall, seed: int) -> Trajectory:
+    """Return poses of a vehicle that goes through the whole area in lanes, there and back.
+
+    Random is along which axis, and where the lanes lie.
+    """
+    rng = np.random.default_rng([seed, 7])
+    along = int(rng.integers(2))
+    reach = HALF_AREA - 0.1
+    across = np.arange(-reach[1 - along] + rng.uniform(0, LANE_M / 2), reach[1 - along], LANE_M)
+    s = np.linspace(-reach[along], reach[along], round(2 * reach[along] / STEP_M))
+    curve = np.empty((len(across), len(s), 2))
+    curve[:, :, along] = s
+    curve[1::2, :, along] = s[::-1]
+    curve[:, :, 1 - along] = across[:, None]
+    path = driven(hall, curve.reshape(-1, 2))
+    return Trajectory(STEP_NS * np.arange(len(path.p)), path.R, path.p, "map", "lidar")
 
 
 def rounds_end(options: ChangesStudyOptions, seed: int, rounds: int) -> RoundsEnd:

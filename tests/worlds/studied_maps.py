@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, HallSurvey, survey
 from l2m_gtsam.simulate.steel_hall import (
@@ -20,7 +20,7 @@ from l2m_gtsam.simulate.steel_hall import (
     hall_cloud,
     steel_hall,
 )
-from l2m_gtsam.studies.statistics import interval_coverage, z_scores
+from l2m_gtsam.studies.statistics import inside_interval
 
 # Of a map's summary.
 NOISE_FACT, VERDICT_FACT = "noise of a reading (uT)", "field"
@@ -255,6 +255,15 @@ def predict(
     )
 
 
+def z_scores(sample: FieldSample, truth: FloatArray) -> FloatArray:
+    """Return (map - truth) / sigma per axis at the points inside the map, shape (M, 3).
+
+    ``truth``, shape (N, 3), is the field without noise: a sample's variance has none.
+    """
+    z = (sample.field - truth) / np.sqrt(sample.variance)
+    return np.asarray(z[sample.inside])
+
+
 def _kinds(cases: Mapping[str, MapCase]) -> Iterator[tuple[str, CloudVariant]]:
     for kind, case in cases.items():
         for cloud in case.clouds:
@@ -280,7 +289,7 @@ def _row(
         sigma=_rms(np.concatenate([p.sigma for p in predictions])),
         z_std=_rms(z),
         z_worst=float(stds[np.argmax(np.abs(np.log(stds)))]),
-        coverage=interval_coverage(z),
+        coverage=float(inside_interval(z).mean()),
         inside=float(np.mean([p.inside for p in predictions])),
         noise=float(np.median([p.noise for p in predictions])),
         doubted=float(np.mean([p.doubted for p in predictions])),

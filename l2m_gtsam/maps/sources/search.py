@@ -26,6 +26,7 @@ REACH_M = 4.0  # of a source: what it adds further away changes nothing
 # Between candidates a source explains more than at the best of them: not three times as much.
 HOPELESS = 0.4  # of the price
 DIPOLE = 6  # parameters
+STARTS = 3  # dipoles that the descent is begun from
 MOST_WRONG = 20  # readings; with more of them it is not single ones that are wrong
 
 
@@ -141,7 +142,7 @@ class SourcePlaces:
                 information[each] = w.T @ w - s.T @ s
         return cls(positions, information)
 
-    def starts(self, rows: MarginalRows, residual: FloatArray, count: int = 3) -> Starts:
+    def starts(self, rows: MarginalRows, residual: FloatArray) -> Starts:
         """Return the dipoles that explain most of residuals in uT, shape (N, 3), the best first."""
         pulled, _ = rows.pull(residual)
         g = np.empty((len(self), 3))
@@ -158,7 +159,7 @@ class SourcePlaces:
             apart = all(np.linalg.norm(self.positions[k] - self.positions[j]) > 0.8 for j in chosen)
             if apart:
                 chosen.append(int(k))
-            if len(chosen) == count:
+            if len(chosen) == STARTS:
                 break
         shapes = [SourceShape.dipole(self.positions[k], moments[k]) for k in chosen]
         return Starts(shapes, float(gains.max()))

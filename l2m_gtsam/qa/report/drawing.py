@@ -23,6 +23,7 @@ LABEL = 10.0  # points, of letters
 POINTS = 72  # of an inch
 PAGE = WIDTH * POINTS  # points across
 LEFT, RIGHT, TOP, BOTTOM = 57.0, 8.0, 21.6, 36.0  # margins in points, for usual labels
+GAP = 9.0  # points between axes above each other
 SAMPLE = 20.0  # points of a line in a legend
 LETTER = 0.53  # of their size: how wide letters are on average
 COLOURS = 48  # that a picture has: as many paths, however many points
@@ -160,7 +161,7 @@ class Panel:
         d = f"M{box.left:.1f} {box.top:.1f}V{box.bottom:.1f}H{box.right:.1f}"
         self.path(d, Stroke(MUTED, 0.7).style)
 
-    def y_axis(self, label: str = "", most: int = 6) -> None:
+    def y_axis(self, label: str, most: int = 6) -> None:
         """Draw lines, ticks and numbers of y, and what it is."""
         ticks = nice(self.y, most)
         at, left = self.down(ticks), self.box.left
@@ -175,9 +176,9 @@ class Panel:
                 f'style="{letters("middle")}">{escape(shown_lines(label))}</text>'
             )
 
-    def x_axis(self, label: str = "", *, most: int = 8) -> None:
+    def x_axis(self, label: str) -> None:
         """Draw lines, ticks and numbers of x, and what it is."""
-        ticks = nice(self.x, most)
+        ticks = nice(self.x, 8)
         self.x_lines(ticks)
         self.x_names(ticks, numbers(ticks))
         self.x_label(label)
@@ -244,12 +245,12 @@ def usual(height: float) -> Rectangle:
     return Rectangle(LEFT, TOP, PAGE - LEFT - RIGHT, POINTS * height - TOP - BOTTOM)
 
 
-def stacked(height: float, count: int, gap: float = 9.0) -> list[Rectangle]:
+def stacked(height: float, count: int) -> list[Rectangle]:
     """Return the rooms for axes above each other in a figure of so many inches."""
     whole = usual(height)
-    each = (whole.height - (count - 1) * gap) / count
+    each = (whole.height - (count - 1) * GAP) / count
     return [
-        Rectangle(whole.left, whole.top + k * (each + gap), whole.width, each) for k in range(count)
+        Rectangle(whole.left, whole.top + k * (each + GAP), whole.width, each) for k in range(count)
     ]
 
 

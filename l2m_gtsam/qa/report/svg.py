@@ -40,7 +40,6 @@ VARIABLES = {
 }
 AXES = (X, Y, Z)
 DASHES = ("-", "--", "-.")  # lines of x, y, z differ without their colours, too
-MARKERS = ("o", "s", "^")
 
 HOVER = (
     "hover-"  # before words, in hexadecimal, that name a part of a figure: they become its title

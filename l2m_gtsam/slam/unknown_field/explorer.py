@@ -99,8 +99,6 @@ class Explorer:
         Prior of the first key pose, and calibrations.
     options
         As of a localisation. Fewer `tiles.modes` take far less time.
-    prior
-        Of the field; if not given it is learnt over the first metres, by poses of odometry.
     pace
         How often is solved, and how much together.
 
@@ -115,7 +113,6 @@ class Explorer:
         start: StartPose,
         sensors: KnownSensors,
         options: SlamOptions,
-        prior: FieldPrior | None = None,
         pace: ExploringOptions | None = None,
     ) -> None:
         if options.drift.axes is StepAxes.FIXED:
@@ -131,7 +128,7 @@ class Explorer:
         self._first, self._solved = 0, -1
         self._past: list[MarginalizedPose] = []
         self._belief = self._prior()
-        self._section = None if prior is None else self._opened(prior)
+        self._section: OpenSection | None = None
 
     @property
     def memory(self) -> FieldMemory:
@@ -187,10 +184,9 @@ class Explorer:
         start: StartPose,
         sensors: KnownSensors,
         options: SlamOptions,
-        pace: ExploringOptions | None = None,
     ) -> "Explorer":
-        """Return an explorer that goes on from a state; other parameters as of the class."""
-        own = cls(start, sensors, options, pace=pace)
+        """Return an explorer that goes on from a state; other parameters are those of the class."""
+        own = cls(start, sensors, options)
         if state.prior is None:
             for each in state.waiting:
                 own.add(each)
@@ -261,14 +257,11 @@ class Explorer:
     def _prior(self) -> Belief:
         return self._memory.belief(0, self._sensors)
 
-    def _opened(self, prior: FieldPrior) -> OpenSection:
-        return OpenSection(self._sensors, prior, self._options, self._memory, 0)
-
     def _learn(self) -> None:
         """Learn the prior at the poses of odometry, and solve for the key poses so far."""
         part = drive_of(self._waiting, self.start, self._sensors)
         prior = drive_prior(part, part.dead_reckoning(), self._options.tiles)
-        self._section = self._opened(prior)
+        self._section = OpenSection(self._sensors, prior, self._options, self._memory, 0)
         waiting, self._waiting = self._waiting, []
         self._belief, self._path_m = self._prior(), 0.0
         for each in waiting:
