@@ -19,8 +19,7 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm
 from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.optimise import LinearSolver
-from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
-from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
+from l2m_gtsam.calibration.uncertain_graph import UncertainDrive, UncertainProblem, starting_values
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings

@@ -11,8 +11,7 @@ from l2m_gtsam.batch.files import SavedMap, read_drive_and_numbers
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.config import Config, with_poses
 from l2m_gtsam.data import KnownSensor, Recording
-from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.frames import frame_of
+from l2m_gtsam.maps.field_map import FieldMap, frame_of
 from l2m_gtsam.progress import silent
 from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.records.calibration import CalibrationResult

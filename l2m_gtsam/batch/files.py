@@ -11,8 +11,7 @@ from l2m_gtsam.config import Config
 from l2m_gtsam.data import MapState, Recording, ScalarSeries, SourceFile
 from l2m_gtsam.errors import BagError, CalibrationError, MapError, OutputError
 from l2m_gtsam.maps.build import map_from_state
-from l2m_gtsam.maps.field_map import FieldMap, Remembering
-from l2m_gtsam.maps.frames import refuse_other_frame
+from l2m_gtsam.maps.field_map import FieldMap, Remembering, refuse_other_frame
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.options import Options, first_fault
 from l2m_gtsam.progress import Count, Progress, counter

@@ -12,23 +12,22 @@ from l2m_gtsam.calibration.explanation import explained
 from l2m_gtsam.calibration.moving_solve import MovingProblem
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.calibration.prepare import prepare
-from l2m_gtsam.calibration.prior_options import priors_of
-from l2m_gtsam.calibration.priors import Priors
+from l2m_gtsam.calibration.priors import Priors, priors_of
 from l2m_gtsam.calibration.start.global_start import find_starts
 from l2m_gtsam.calibration.stretch_causes import with_causes
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.calibration.verdicts import SolvedDrive, sensor_verdicts
 from l2m_gtsam.calibration.view import Compilable, QueryableMap, RememberedMap
-from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
+from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile, Synchronised
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.maps.field_map import Summarised
-from l2m_gtsam.maps.frames import check_frame
+from l2m_gtsam.maps.field_map import Summarised, check_frame
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.drive_trace import trace_of
-from l2m_gtsam.recording.joining import drive_at, own_ns
-from l2m_gtsam.recording.sync import stuck_readings
+from l2m_gtsam.recording.joining import drive_at, joined_readings, own_ns
+from l2m_gtsam.recording.pose_noise import pose_roots
+from l2m_gtsam.recording.regressors import check_changes, with_regressors
+from l2m_gtsam.recording.sync import stuck_readings, synchronise
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     Disagreement,
@@ -173,6 +172,39 @@ def calibrated(
         recorded=tuple(map(_recorded, recording.parts)),
     )
     return Calibrated(result, solution, field_map, solver_map)
+
+
+def prepare(recording: Recording, options: CalibrationOptions) -> Synchronised:
+    """Return the readings that take part, their poses, how these move and how wrong they are.
+
+    Of a vehicle that stands still, velocities are the noise of its poses: they are left out, as
+    they are where clocks are known to agree. Drives that were joined are prepared one by one: a
+    place that was read in one drive is read anew in the next.
+
+    Raises
+    ------
+    SyncError
+        Readings and poses or recorded numbers of a drive do not overlap, or a number never changes.
+    """
+    parts = [_prepared(drive, options) for drive in recording.parts]
+    whole = joined_readings(parts, recording)
+    check_changes(whole.readings, recording.scalars)
+    return whole
+
+
+def _prepared(recording: Recording, options: CalibrationOptions) -> Synchronised:
+    """Return the same for a single drive."""
+    largest, poses = options.solve.largest_offset_s, recording.trajectory
+    synchronised = synchronise(recording, options.sync, largest)
+    synchronised = with_regressors(synchronised, recording.scalars, options.regressors)
+    readings = synchronised.readings
+    still = movement(poses.R, poses.p).at_rest
+    readings = replace(
+        readings,
+        motion=None if still or not largest else readings.motion,
+        pose_root=pose_roots(poses, readings.stamp_ns, options.solve.pose_noise),
+    )
+    return replace(synchronised, readings=readings)
 
 
 def _rejected_stretches(

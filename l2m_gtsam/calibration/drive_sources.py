@@ -1,18 +1,31 @@
-"""Steel that a drive shows beside a map: what changed since the survey, and what that missed."""
+"""Steel that a drive shows beside a map: what changed since the survey, and what that missed.
 
+A map keeps the readings of its survey. Where it does not explain them, as where it takes a box for
+floor, a drive differs from it as if steel had come. With e what the survey's readings lack of the
+map, b the field of a source that a drive shows and sigma the noise of a reading,
+
+    sum (|e|^2 - |e - b|^2) / sigma^2
+
+is twice the logarithm of the likelihood that the source stood there already over that it did not:
+neither has parameters that the other has not. Steel that came or went since leaves -sum |b|^2 /
+sigma^2, and where a source is beyond reach of the survey nothing is said.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive
 from l2m_gtsam.calibration.causes import changed_sources
-from l2m_gtsam.calibration.missed_steel import missed_by_map
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.maps.field_map import Surveyed
 from l2m_gtsam.maps.sources.found_sources import FoundSources, price, refined
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
-from l2m_gtsam.records.places import ChangedSource
+from l2m_gtsam.maps.sources.search import REACH_M, SourceSearchOptions, find_sources
+from l2m_gtsam.maps.sources.source import SourceShape
+from l2m_gtsam.records.places import CLEAR, ChangedSource
 
 
 @dataclass(frozen=True)
@@ -85,3 +98,31 @@ def drive_sources(
     found = find_sources(rows, suspected, options, known)
     missed = missed_by_map(found.shapes, field_map)
     return DriveSources(rows.without(found.wrong), drive, found, missed)
+
+
+def missed_by_map(shapes: Sequence[SourceShape], field_map: QueryableMap) -> BoolArray:
+    """Return which sources the readings of a map's survey clearly show as well, shape (K,).
+
+    None of a map that keeps no readings.
+
+    Parameters
+    ----------
+    shapes
+        Sources that a drive shows beside the map, K of them.
+    field_map
+        As it was surveyed.
+    """
+    if not shapes or not isinstance(field_map, Surveyed):
+        return np.zeros(len(shapes), dtype=np.bool_)
+    near = field_map.readings.tree.query_ball_point([each.position for each in shapes], REACH_M)
+    read = field_map.readings[np.unique(np.concatenate([np.array(rows, int) for rows in near]))]
+    if not len(read):
+        return np.zeros(len(shapes), dtype=np.bool_)
+    field, _ = field_map.field_and_gradient(read.points)
+    lacking, weight = read.field - field, read.weight[:, None]
+    variance = float(np.mean(weight * lacking**2))
+    gains = []
+    for shape in shapes:
+        b, _ = shape.field_and_gradient(read.points)
+        gains.append(float(np.sum(weight * b * (2 * lacking - b))))
+    return np.array(gains) > CLEAR * variance

@@ -14,8 +14,7 @@ from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution, joint_problem, sensor_solutions
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
-from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
+from l2m_gtsam.calibration.uncertain_graph import UncertainDrive, UncertainProblem, starting_values
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import QueryableMap, StandIns, View, glimpse, observe
 from l2m_gtsam.data import FloatArray, Readings

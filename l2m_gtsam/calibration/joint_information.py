@@ -27,7 +27,7 @@ from scipy.linalg.lapack import dpotri
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.solve.submatrix import add_upper, submatrix, upper_product
+from l2m_gtsam.solve.linear_algebra import add_upper, submatrix, upper_product
 
 SHARED = -1  # of rows that are no one sensor's
 NO_READINGS = np.empty(0, dtype=np.int64)

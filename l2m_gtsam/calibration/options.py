@@ -4,7 +4,7 @@ from pydantic import Field
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.changed_places import ChangesOptions
-from l2m_gtsam.calibration.prior_options import PriorOptions
+from l2m_gtsam.calibration.priors import PriorOptions
 from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.recording.regressors import ResampleOptions

@@ -31,8 +31,13 @@ from l2m_gtsam.calibration.optimise import Ending, LinearSolver
 from l2m_gtsam.calibration.parts_alone import ByParts
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.stated_sizes import leave_noise
-from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
-from l2m_gtsam.calibration.uncertain_graph import ROUND_SIGMAS, THERE_SIGMAS, UncertainProblem
+from l2m_gtsam.calibration.uncertain_graph import (
+    ROUND_SIGMAS,
+    THERE_SIGMAS,
+    UncertainDrive,
+    UncertainProblem,
+    starting_values,
+)
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap, View
 from l2m_gtsam.data import FloatArray

@@ -1,7 +1,10 @@
-"""The graph of the last stage: readings, priors, and what they share, at weights of an estimate."""
+"""The graph of the last stage: readings, the map, priors, and the errors that readings share.
+
+What all rounds have in common is an `UncertainDrive`; each has a graph at weights of its own.
+"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -13,6 +16,8 @@ from l2m_factors import (
     uncertain_reading_factor,
 )
 from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
+from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
 from l2m_gtsam.calibration.group_noise import group_noise
 from l2m_gtsam.calibration.joint_information import (
@@ -22,6 +27,7 @@ from l2m_gtsam.calibration.joint_information import (
     joint_information,
     rows_of_factors,
 )
+from l2m_gtsam.calibration.moving_fields import moving_fields
 from l2m_gtsam.calibration.optimise import (
     NEARLY,
     TOLERANCE,
@@ -33,7 +39,8 @@ from l2m_gtsam.calibration.optimise import (
     polish,
 )
 from l2m_gtsam.calibration.sensor_columns import columns_of, keys_of
-from l2m_gtsam.calibration.uncertain_drive import UncertainDrive
+from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.solve.rank import Determinacy
 
 # A Gauss-Newton step of such a length leaves less than a hundredth of a sigma: from 0.17 it left
@@ -46,6 +53,92 @@ ROUND_SIGMAS = 0.6
 # A round whose step is as short as this for all variables together may be the last.
 THERE_SIGMAS = 1.0
 POLISHING_STEPS = 2  # each shortens what remains fourfold at least
+
+
+def starting_values(estimate: Estimate, sensors: list[int], coverage: Coverage) -> gtsam.Values:
+    """Return all variables of the graph, with no error of map or poses."""
+    values = estimate.values(sensors)
+    for key, size in coverage.sizes.items():
+        values.insert(key, np.zeros(size))
+    return values
+
+
+@dataclass(frozen=True)
+class WeightsPrior:
+    """What is known of shared errors before any reading: the same in all rounds.
+
+    Attributes
+    ----------
+    coverage
+        The errors.
+    graph
+        Their prior as factors.
+    information
+        The same as a matrix, shape (K, K).
+    """
+
+    coverage: Coverage
+    graph: gtsam.NonlinearFactorGraph
+    information: FloatArray
+
+    @property
+    def sizes(self) -> dict[int, int]:
+        """Number of weights of each key."""
+        return self.coverage.sizes
+
+    @classmethod
+    def of(cls, coverage: Coverage) -> "WeightsPrior":
+        """Return the prior of the weights of a coverage."""
+        tiles = coverage.tile_information
+        information = np.zeros((sum(coverage.sizes.values()),) * 2)
+        information[: len(tiles), : len(tiles)] = tiles
+        if beside := list(coverage.sizes.items())[len(coverage.tiles) :]:
+            zero, ordering = gtsam.Values(), gtsam.Ordering()
+            for key, size in beside:
+                zero.insert(key, np.zeros(size))
+                ordering.push_back(key)
+            linear = coverage.prior_beside_tiles().linearize(zero)
+            information[len(tiles) :, len(tiles) :], _ = linear.hessian(ordering)
+        return cls(coverage, coverage.prior(), information)
+
+
+@dataclass(frozen=True)
+class UncertainDrive:
+    """What all rounds have in common: readings, the map, and the errors that readings share."""
+
+    view: View
+    field_map: QueryableMap
+    prior: WeightsPrior
+
+    @property
+    def budget(self) -> Budget:
+        """Processes that its graph has."""
+        return self.prior.coverage.budget
+
+    @classmethod
+    def of(
+        cls,
+        view: View,
+        field_map: QueryableMap,
+        errors: UncertainMap,
+        near: Estimate,
+        options: OneKeyOptions,
+        budget: Budget = NOTHING_FOUND,
+    ) -> "UncertainDrive":
+        """Return what readings share where an estimate puts them."""
+        view = replace(view, readings=budget.on(view.readings))
+        coverage = cover(view, errors, near, budget.lasting(options.pose_noise.lasting_s))
+        moving = moving_fields(view.readings, options.moving_field_ut)
+        coverage = replace(coverage, moving=moving, budget=budget)
+        return cls(view, field_map, WeightsPrior.of(coverage))
+
+    def beside(self, budget: Budget) -> "UncertainDrive":
+        """Return the same with processes that are no errors of poses, and the map as it was asked.
+
+        Errors of poses cut a drive at other knots, for which the map has to be asked again.
+        """
+        coverage = replace(self.prior.coverage, budget=budget)
+        return replace(self, prior=WeightsPrior.of(coverage))
 
 
 @dataclass(frozen=True)

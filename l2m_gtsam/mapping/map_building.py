@@ -13,13 +13,11 @@ from l2m_gtsam.mapping.shifts import suite_errors, survey_poses
 from l2m_gtsam.mapping.suite_calibration import steady_survey, suite_doubts
 from l2m_gtsam.maps.build import KINDS, build_map
 from l2m_gtsam.maps.compare import MapComparison, compare_maps
-from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.frames import check_frame, framed
+from l2m_gtsam.maps.field_map import FieldMap, check_frame, framed
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.reading_errors import errors_together
 from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.maps.survey_poses import SurveyPoses
-from l2m_gtsam.maps.training import checked_readings
+from l2m_gtsam.maps.training import checked_readings, errors_together
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions

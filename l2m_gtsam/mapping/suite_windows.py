@@ -7,13 +7,11 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.mapping.options import SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_likelihood import SuiteWindow, undistorted
-from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.basis import COARSE, Basis, basis_of
 from l2m_gtsam.maps.harmonic.evidence import normal_of
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
-from l2m_gtsam.maps.harmonic.furnish import COARSE, basis_of
 from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
-from l2m_gtsam.maps.harmonic.representatives import spread_tiles
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, Sources
 from l2m_gtsam.maps.harmonic.teaching import learn_map, learn_strengths
 from l2m_gtsam.maps.harmonic.tiling import (
@@ -21,6 +19,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
     Tiling,
     affordable,
     resolution_of,
+    spread_tiles,
     surveyed_area,
     tiling_of,
 )

@@ -10,8 +10,7 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.bilinear.bilinear_map import BilinearMap
 from l2m_gtsam.maps.bilinear.cells import BilinearOptions
 from l2m_gtsam.maps.dense_gp import DenseGP, DenseGPOptions
-from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.frames import framed
+from l2m_gtsam.maps.field_map import FieldMap, framed
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions

@@ -1,7 +1,8 @@
-"""The readings that a map is trained on: checked, and thinned to what they determine."""
+"""The readings that a map is trained on: checked, thinned, and with the errors that they share."""
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -216,3 +217,26 @@ def joined(first: TrainingSet, second: TrainingSet) -> TrainingSet:
         np.concatenate([first.field, second.field]),
         np.concatenate([first.weight, second.weight]),
     )
+
+
+class ReadingErrors(Protocol):
+    """Errors of readings that are known by their numbers."""
+
+    def followed_by(self, other: Self, first: int) -> Self:
+        """Return them with those of other readings, the first of which has this number."""
+
+    def from_reading(self, first: int) -> Self:
+        """Return the same of readings that begin with this number."""
+
+
+Errors = TypeVar("Errors", bound=ReadingErrors)
+
+
+def errors_together(before: Errors | None, after: Errors | None, first: int) -> Errors | None:
+    """Return the errors of readings and of others after them; see ``ReadingErrors.followed_by``.
+
+    Absent are those of what counts as exact.
+    """
+    if after is None:
+        return before
+    return after.from_reading(first) if before is None else before.followed_by(after, first)

@@ -4,13 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l2m_gtsam.calibration.calibrate import prepare
 from l2m_gtsam.calibration.explanation import from_priors, undetermined
 from l2m_gtsam.calibration.forecast import Forecast, forecast
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.calibration.prepare import prepare
-from l2m_gtsam.calibration.prior_options import priors_of
-from l2m_gtsam.calibration.priors import Priors
+from l2m_gtsam.calibration.priors import Priors, priors_of
 from l2m_gtsam.calibration.start.rigid_groups import placed
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import (
@@ -26,8 +25,7 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.geometry import polar_rotation
-from l2m_gtsam.maps.field_map import Summarised
-from l2m_gtsam.maps.frames import check_frame
+from l2m_gtsam.maps.field_map import Summarised, check_frame
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.planning.motion import (
     ExtraMotion,

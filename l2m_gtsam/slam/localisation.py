@@ -9,7 +9,7 @@ from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import FloatArray, Readings, Recording, RigidTransform, Trajectory
 from l2m_gtsam.errors import CalibrationError, ConfigError, SyncError
 from l2m_gtsam.geometry import isotropic_covariance
-from l2m_gtsam.maps.frames import check_frame
+from l2m_gtsam.maps.field_map import check_frame
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.dropouts import is_dead, mask_dropouts

@@ -16,8 +16,7 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import SurveyReadings, suite_readings
 from l2m_gtsam.mapping.options import MappingOptions
-from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.frames import check_frame
+from l2m_gtsam.maps.field_map import FieldMap, check_frame
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.renewal import DriveReadings, renewed
 from l2m_gtsam.maps.training import additional_set

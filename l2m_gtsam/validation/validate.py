@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l2m_gtsam.calibration.calibrate import prepare
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers, places_of
 from l2m_gtsam.data import (
     FloatArray,
@@ -18,7 +18,7 @@ from l2m_gtsam.data import (
     same_content,
 )
 from l2m_gtsam.errors import CalibrationError, ConfigError
-from l2m_gtsam.maps.frames import check_frame
+from l2m_gtsam.maps.field_map import check_frame
 from l2m_gtsam.maps.sources.changed_map import ChangedMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent

@@ -9,11 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.harmonic import learning
-from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.basis import Basis, basis_of
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
-from l2m_gtsam.maps.harmonic.furnish import basis_of
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to

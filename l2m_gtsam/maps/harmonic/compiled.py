@@ -11,14 +11,13 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, compile_tile, sources_of
+from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, TermSum, compile_tile, sources_of
 from l2m_gtsam.maps.harmonic.entries import compiled_entry, finite, floats, integers
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.near_sources import NearSources
 from l2m_gtsam.maps.harmonic.places import AlongX, Places
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid
-from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_shares import Blend
 from l2m_gtsam.maps.harmonic.tiles import Tiles

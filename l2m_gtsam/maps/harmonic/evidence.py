@@ -21,7 +21,7 @@ from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
 from l2m_gtsam.maps.training import TrainingSet
-from l2m_gtsam.solve.submatrix import submatrix
+from l2m_gtsam.solve.linear_algebra import submatrix
 
 ROUNDING, LOST = 1e-14, 1e-11
 

@@ -8,12 +8,10 @@ from pydantic import Field
 from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.basis import COARSE, Basis, basis_of
 from l2m_gtsam.maps.harmonic.evidence import Normal, evidence, normal_of
 from l2m_gtsam.maps.harmonic.family import BOUNDS, Hyperparameters
-from l2m_gtsam.maps.harmonic.furnish import COARSE, basis_of
 from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters
-from l2m_gtsam.maps.harmonic.representatives import rough_tiles, spread_tiles
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import (
     FINER,
@@ -22,6 +20,8 @@ from l2m_gtsam.maps.harmonic.tiling import (
     TilingOptions,
     affordable,
     resolution_of,
+    rough_tiles,
+    spread_tiles,
     surveyed_area,
     tiling_of,
 )

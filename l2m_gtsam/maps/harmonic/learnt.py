@@ -8,11 +8,10 @@ from pydantic import Field, TypeAdapter
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.grid import grid_from
-from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.basis import FINE, Basis, basis_of
 from l2m_gtsam.maps.harmonic.explanation import UNJUDGED, Explanation
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
-from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of
 from l2m_gtsam.maps.harmonic.history import History
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions
 from l2m_gtsam.maps.harmonic.local import LocalOptions
@@ -28,11 +27,10 @@ from l2m_gtsam.maps.harmonic.tiling import (
     surveyed_area,
     tiling_of,
 )
-from l2m_gtsam.maps.reading_errors import errors_together
 from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.survey_poses import SurveyPoses
-from l2m_gtsam.maps.training import TrainingSet, cubes_of, joined, merged
+from l2m_gtsam.maps.training import TrainingSet, cubes_of, errors_together, joined, merged
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.map_diary import UNDATED, MapDrive
 

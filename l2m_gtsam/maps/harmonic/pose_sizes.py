@@ -19,14 +19,14 @@ from functools import partial
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.harmonic.basis import COARSE
 from l2m_gtsam.maps.harmonic.error_modes import suite_root
 from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
-from l2m_gtsam.maps.harmonic.furnish import COARSE
 from l2m_gtsam.maps.harmonic.learning import Window, maximise
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
-from l2m_gtsam.maps.harmonic.representatives import spread_tiles
 from l2m_gtsam.maps.harmonic.tile_sums import shared_noise
 from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.maps.harmonic.tiling import spread_tiles
 from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.solve.variance_components import (

@@ -7,7 +7,7 @@ from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.basis import COARSE, Basis
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.evidence import (
     Normal,
@@ -20,10 +20,8 @@ from l2m_gtsam.maps.harmonic.evidence import (
 )
 from l2m_gtsam.maps.harmonic.explanation import explanation_of, patchwork
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
-from l2m_gtsam.maps.harmonic.furnish import COARSE
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
-from l2m_gtsam.maps.harmonic.representatives import rough_tiles, spread_tiles
 from l2m_gtsam.maps.harmonic.search import (
     MOST_READINGS,
     Found,
@@ -33,6 +31,7 @@ from l2m_gtsam.maps.harmonic.search import (
     unvisited,
 )
 from l2m_gtsam.maps.harmonic.structure import Sources
+from l2m_gtsam.maps.harmonic.tiling import rough_tiles, spread_tiles
 from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
 from l2m_gtsam.parallel.threads import in_threads

@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import ValidationError
 
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.harmonic.basis import basis_with
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.entries import finite, solved_entry
 from l2m_gtsam.maps.harmonic.evidence import Weights, condition
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.frame import TileFrame
-from l2m_gtsam.maps.harmonic.furnish import basis_with
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.local import local_hyperparameters
 from l2m_gtsam.maps.harmonic.tile import Tile

@@ -4,6 +4,12 @@ A source is looked for on a coarse grid, where its moment is linear: with the pr
 readings, D the field of unit moments, ``F = D^T P D`` and ``g = D^T P e``, it explains
 ``g^T F^{-1} g``, twice the logarithm of the likelihood ratio. The best one is refined together with
 all that were found before, and stays if it explains more than its parameters do by chance.
+
+It is a dipole, a bar that stands or one that lies, and has to earn each of its parameters (Schwarz
+1978): what is not found yet looks like the length of a bar as well. With all sources found, each
+one's shape is decided again by its evidence. What a length costs then is how much narrower readings
+make it than it was beforehand, so that a length which they leave open stays open, and widens the
+sigma of the moment.
 """
 
 from dataclasses import dataclass, replace
@@ -14,11 +20,9 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
-from l2m_gtsam.maps.sources.dipole_or_bar import best_of, reshaped
 from l2m_gtsam.maps.sources.found_sources import FoundSources, nothing_found, price, refined
 from l2m_gtsam.maps.sources.marginal import AXES, MarginalRows
 from l2m_gtsam.maps.sources.source import UT_M3, SourceShape
-from l2m_gtsam.maps.sources.wrong_reading import wrong_reading
 from l2m_gtsam.options import Options
 
 BATCH = 128  # candidates that are asked together
@@ -28,6 +32,13 @@ HOPELESS = 0.4  # of the price
 DIPOLE = 6  # parameters
 STARTS = 3  # dipoles that the descent is begun from
 MOST_WRONG = 20  # readings; with more of them it is not single ones that are wrong
+FIRST_HALF_M = (0.3, 0.8)  # where the length of a bar is started, near a dipole and elsewhere
+# Bars stand upright or lie: components of the axis that are zero stay so.
+STANDING = np.array([[0.0, 0.0, 1.0]])
+LYING = np.array([[0.92, 0.39, 0.0], [-0.39, 0.92, 0.0]])
+NO_LENGTH = np.zeros((1, 3))
+ROUNDS = 3  # of deciding on all shapes: sources beside each other share a field
+BARE_MENTION = 2.0  # evidence that is not worth more (Kass and Raftery 1995, 3.2)
 
 
 class SourceSearchOptions(Options):
@@ -234,3 +245,90 @@ def away(found: FoundSources, rows: MarginalRows) -> FloatArray:
     """Return the distance of the nearest reading to each source, metres, shape (K,)."""
     places = np.array([each.position for each in found.shapes]).reshape(-1, 3)
     return np.asarray(cKDTree(rows.points).query(places)[0])
+
+
+def wrong_reading(
+    rows: MarginalRows, residual: FloatArray, field: FloatArray, least: float, price: float
+) -> int | None:
+    """Return the reading that is wrong where that explains what a source does; none otherwise.
+
+    Both are judged by what they explain less what they have to. If one wrong reading is the better
+    explanation, the source has to explain enough beside it.
+
+    Parameters
+    ----------
+    rows
+        N readings.
+    residual
+        What they differ by from all but the source, uT, shape (N, 3).
+    field
+        The source's, as it was fitted, uT, shape (N, 3).
+    least
+        What the source has to explain.
+    price
+        What as many parameters as a reading has axes have to; that there are as many readings to
+        choose from is added here.
+    """
+    pulled, _ = rows.pull(residual)
+    most = int(np.argmax(np.einsum("ni,ni->n", field, pulled)))
+    features = np.zeros((len(rows), AXES, 1 + AXES))
+    features[:, :, 0], features[most, :, 1:] = field, np.eye(AXES)
+    F, g = rows.information(features), np.einsum("nim,ni->m", features, pulled)
+    source = g[0] ** 2 / F[0, 0]
+    reading = float(g[1:] @ np.linalg.solve(F[1:, 1:], g[1:]))
+    # Elsewhere the source may change hardly any reading: then both explain the same.
+    both = float(g @ np.linalg.lstsq(F, g, rcond=1e-10)[0])
+    worth = reading - price - 2 * float(np.log(len(rows)))
+    return most if worth > source - least and both - reading < least else None
+
+
+def best_of(rows: MarginalRows, found: FoundSources, starts: list[SourceShape]) -> FoundSources:
+    """Return the best refinement of sources and one more, a dipole or a bar."""
+    dipole = min((refined(rows, (*found.shapes, each)) for each in starts), key=_left)
+    best, before = dipole, (*dipole.shapes[:-1],)
+    for axes in (STANDING, LYING):
+        near, elsewhere = FIRST_HALF_M
+        bars = [
+            refined(rows, (*before, dipole.shapes[-1].with_half_axis(near * axis))) for axis in axes
+        ]
+        bars += [
+            refined(rows, (*found.shapes, starts[0].with_half_axis(elsewhere * axis)))
+            for axis in axes
+        ]
+        bar = min(bars, key=_left)
+        if best.left - bar.left > price(rows, bar.parameters - best.parameters):
+            best = bar
+    return best
+
+
+def reshaped(rows: MarginalRows, found: FoundSources) -> FoundSources:
+    """Return the same sources, each with the shape that has most evidence beside the others."""
+    for _ in range(ROUNDS):
+        before = found
+        for k in range(len(found)):
+            other = max(_of_other_shapes(rows, found, k), key=_evidence)
+            found = other if other.evidence > found.evidence + BARE_MENTION else found
+        if found is before:
+            break
+    return found
+
+
+def _of_other_shapes(rows: MarginalRows, found: FoundSources, k: int) -> list[FoundSources]:
+    """Return sources of which one has another shape than it has."""
+    half_axis = found.shapes[k].half_axis
+    shape_of_now = STANDING if half_axis[2] else LYING if half_axis.any() else NO_LENGTH
+    others = [axes for axes in (NO_LENGTH, STANDING, LYING) if axes is not shape_of_now]
+    start = FIRST_HALF_M[0] * np.concatenate(others)
+    shapes = found.shapes
+    return [
+        refined(rows, (*shapes[:k], shapes[k].with_half_axis(each), *shapes[k + 1 :]))
+        for each in start
+    ]
+
+
+def _left(found: FoundSources) -> float:
+    return found.left
+
+
+def _evidence(found: FoundSources) -> float:
+    return found.evidence

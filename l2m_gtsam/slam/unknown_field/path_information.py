@@ -33,8 +33,7 @@ from l2m_gtsam.slam.solver import colamd_ordering
 from l2m_gtsam.slam.unknown_field.path_density import PathDensity, PathReadings
 from l2m_gtsam.slam.unknown_field.sensor_noise import NS, NoiseInformation, SensorNoise
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
-from l2m_gtsam.solve.lanczos import eigenpairs
-from l2m_gtsam.solve.linear_algebra import covariance_root
+from l2m_gtsam.solve.linear_algebra import covariance_root, eigenpairs
 
 VECTORS = 120  # of Lanczos' iteration; with twice as many sigmas are 4 to 5 % smaller
 LEAST = 0.01  # eigenvalue: less of it would change a variance by 1 %

@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.basis import UNIFORM_SIGMA, Basis
 from l2m_gtsam.maps.harmonic.family import Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
-from l2m_gtsam.maps.harmonic.furnish import UNIFORM_SIGMA
 from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to

@@ -20,8 +20,7 @@ from l2m_gtsam.calibration.optimise import (
     joint_covariance,
     optimise,
 )
-from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
-from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
+from l2m_gtsam.calibration.uncertain_graph import UncertainDrive, UncertainProblem, starting_values
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import View, observe
 from l2m_gtsam.data import FloatArray, Readings

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from l2m_gtsam.calibration.missed_steel import missed_by_map
+from l2m_gtsam.calibration.drive_sources import missed_by_map
 from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.sources.source import SourceShape
 from l2m_gtsam.maps.training import TrainingSet

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.sources.dipole_or_bar import reshaped
 from l2m_gtsam.maps.sources.found_sources import refined
-from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
+from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources, reshaped
 from l2m_gtsam.maps.sources.source import MOMENT, SourceShape
 from tests.worlds.loop_rows import BAR, DIPOLE, loop_path, rows_with
 

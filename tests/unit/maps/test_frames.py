@@ -14,8 +14,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import L2MError, MapError
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map, map_from_state
-from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.frames import check_frame, frame_of, framed
+from l2m_gtsam.maps.field_map import FieldMap, check_frame, frame_of, framed
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.planning.plan import plan
 from l2m_gtsam.records.calibration import CalibrationResult, Uncertainty

@@ -6,7 +6,7 @@ import pytest
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
-from l2m_gtsam.maps.harmonic.representatives import rough_tiles, roughness
+from l2m_gtsam.maps.harmonic.tiling import rough_tiles, roughness
 from l2m_gtsam.maps.training import training_set
 from tests.worlds.exact import DipoleWorld
 from tests.worlds.harmonic import NO_SEARCH, OPTIONS, WORLD, readings

@@ -6,10 +6,10 @@ import pytest
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic import structure
+from l2m_gtsam.maps.harmonic.basis import FINE, basis_of, dipoles_of
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
 from l2m_gtsam.maps.harmonic.evidence import normal_of
 from l2m_gtsam.maps.harmonic.frame import tile_frame
-from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of, dipoles_of
 from l2m_gtsam.maps.harmonic.structure import (
     NO_SOURCES,
     SIGHT,

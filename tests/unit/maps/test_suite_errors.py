@@ -12,9 +12,8 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.suite_found import shown
-from l2m_gtsam.maps.reading_errors import errors_together
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
-from l2m_gtsam.maps.training import cubes_of, merged, training_set
+from l2m_gtsam.maps.training import cubes_of, errors_together, merged, training_set
 from tests.worlds.harmonic import OPTIONS, POST, readings, within_survey
 
 SIGMA = np.repeat([0.005, 0.01, 0.5, 0.002], [3, 9, 3, 1])

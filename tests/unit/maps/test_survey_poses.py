@@ -19,10 +19,9 @@ from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 from l2m_gtsam.maps.harmonic.tile_correlation import shared_poses, within_whole
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.maps.reading_errors import errors_together
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.maps.survey_poses import KNOTS, SurveyPoses
-from l2m_gtsam.maps.training import TrainingSet, cubes_of
+from l2m_gtsam.maps.training import TrainingSet, cubes_of, errors_together
 from tests.worlds.exact import DipoleWorld, dipole_world
 from tests.worlds.harmonic import GIVEN, basis, places, rms
 

@@ -5,13 +5,12 @@ import pytest
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis
-from l2m_gtsam.maps.harmonic.compiled_tile import sources_of
+from l2m_gtsam.maps.harmonic.compiled_tile import TermSum, sources_of
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.evidence import Weights
 from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
-from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor

@@ -4,8 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from l2m_gtsam.maps.posterior import kernel_matrix
-from l2m_gtsam.maps.whitener import STRIPE, Whitener
+from l2m_gtsam.maps.posterior import STRIPE, Whitener, kernel_matrix
 
 SIGNAL, NOISE = 8.0, 0.3  # uT
 

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
+from l2m_gtsam.calibration.calibrate import prepare
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.pose_errors import PoseKnots
-from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,

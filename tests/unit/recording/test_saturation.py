@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from l2m_gtsam.calibration.calibrate import prepare
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.data import FloatArray, SaturatedAxis, SourceFile
 from l2m_gtsam.recording.dropouts import mask_dropouts
 from l2m_gtsam.recording.joining import joined

@@ -1,18 +1,23 @@
 """Roots of covariances: they multiply to the matrix they were taken of, singular ones too."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from l2m_gtsam.solve.linear_algebra import (
+    add_upper,
     correlation_factor,
     covariance_root,
+    eigenpairs,
     information_root,
     leading_eigenvectors,
     lower_information_root,
     right_divided,
+    submatrix,
     triangular_information_root,
     triangular_rows,
+    upper_product,
 )
 
 
@@ -108,3 +113,45 @@ def test_triangular_rows_have_the_same_squares(seed: int, rows: int, columns: in
     np.testing.assert_array_equal(R, np.triu(R))
     # Rounding of at most 60 products of numbers of order one.
     np.testing.assert_allclose(R.T @ R, given_rows.T @ given_rows, rtol=0, atol=1e-11)
+
+
+@given(n=st.integers(1, 12), share=st.floats(0, 1), seed=st.integers(0, 2**32 - 1))
+def test_they_are_what_indexing_by_two_lists_gives(n: int, share: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    matrix, at = rng.normal(size=(n, n)), rng.permutation(n)[: round(share * n)]
+    half = rng.normal(size=(len(at), len(at)))
+    block, both = half + half.T, np.ix_(at, at)
+    np.testing.assert_array_equal(submatrix(matrix, at), matrix[both])
+    upper = np.triu(matrix)[both]
+    # Sums of at most 144 products, of either order: rounding.
+    assert upper_product(matrix, at, block) == pytest.approx((upper * block).sum(), abs=1e-12)
+    added, wanted = matrix.copy(), np.zeros((n, n))
+    wanted[both] = block
+    add_upper(added, at, block)
+    np.testing.assert_array_equal(added, matrix + np.triu(wanted))
+
+
+def test_a_whole_krylov_space_has_all_eigenvalues() -> None:
+    rng = np.random.default_rng(1)
+    half = rng.normal(size=(30, 30))
+    matrix = half + half.T
+    values, vectors = eigenpairs(lambda v: matrix @ v, rng.normal(size=30), 30)
+    np.testing.assert_allclose(values, np.linalg.eigvalsh(matrix), atol=1e-9)
+    np.testing.assert_allclose((vectors * values) @ vectors.T, matrix, atol=1e-9)
+
+
+def test_the_largest_are_found_first() -> None:
+    """Twenty directions of 200 that count, found in a space of 60."""
+    rng = np.random.default_rng(2)
+    basis = np.linalg.qr(rng.normal(size=(200, 200)))[0]
+    true = np.append(np.geomspace(1e4, 10, 20), rng.uniform(0, 0.1, 180))
+    values, _ = eigenpairs(lambda v: basis @ (true * (basis.T @ v)), rng.normal(size=200), 60)
+    np.testing.assert_allclose(values[-20:], true[:20][::-1], rtol=1e-6)
+
+
+def test_an_invariant_space_ends_the_iteration() -> None:
+    """Five distinct eigenvalues: no vector is outside of five dimensions."""
+    matrix = np.diag(np.repeat([1.0, 2.0, 3.0, 4.0, 5.0], 4))
+    values, vectors = eigenpairs(lambda v: matrix @ v, np.ones(20), 20)
+    np.testing.assert_allclose(values, [1, 2, 3, 4, 5], atol=1e-9)
+    assert vectors.shape == (20, 5)
