@@ -19,8 +19,8 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.lidar.loop_closures import LoopOptions
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.online.loop_matcher import LoopMatcher
 from l2m_gtsam.slam.online.replay import Message, give, messages, with_scans
+from l2m_gtsam.slam.online.scan_matching import LoopMatcher
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from tests.drives.exploring import rms

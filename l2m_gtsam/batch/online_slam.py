@@ -34,10 +34,9 @@ from l2m_gtsam.records.localisation_file import TruthRecord
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.online.events import OnlineEvent
-from l2m_gtsam.slam.online.loop_matcher import LoopMatcher
 from l2m_gtsam.slam.online.replay import give, messages, with_scans
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
-from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
+from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanMatcher
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from l2m_gtsam.slam.options import CalibrationUse, Usage
 from l2m_gtsam.slam.result import refined

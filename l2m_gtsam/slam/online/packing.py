@@ -1,6 +1,7 @@
 """What estimators on line remember as plain arrays, and back."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -8,18 +9,27 @@ import numpy as np
 import numpy.typing as npt
 
 from l2m_factors import KeyPoseReadings
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.maps.potential import PotentialHyperparameters
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import FixedStep
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+from l2m_gtsam.slam.online.scan_matching import KeptScan, LoopMatcher
 from l2m_gtsam.slam.online.tracked_drift import DriftPrior, TrackedDrift, WaySinceAnchor
+from l2m_gtsam.slam.unknown_field.field_filter import FilterState
+from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
+from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldState, SolvedBeginning
+from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
+from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
+from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
 
 Arrays = dict[str, npt.NDArray[Any]]
 LINKS = ("origin", "key_pose", "R", "p", "covariance")
 WAY = ("p", "p_covariance", "shift", "random", "drift_m")
 READINGS = ("key_pose", "sensor", "R_key_lidar", "p_key_lidar", "fraction", "field")
+STATE = ("weights", "distortion", "steady", "covariance")
 
 
 def named(prefix: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Arrays:
@@ -167,3 +177,113 @@ def unpacked_gaussian(arrays: Arrays) -> JointGaussian:
             values.insert(key, mean[at : at + size])
             at += size
     return JointGaussian(values, sizes, arrays["covariance"])
+
+
+def packed_loops(matcher: LoopMatcher) -> Arrays:
+    """Return what a matcher remembers as arrays."""
+    kept = matcher.kept
+    points = [np.empty((0, 3), dtype=np.float32), *(each.points for each in kept)]
+    return {
+        "path_m": np.array([matcher.path_m, matcher.last_m]),
+        "key_pose": np.array([each.key_pose for each in kept], dtype=np.int64),
+        "stamp_ns": np.array([each.stamp_ns for each in kept], dtype=np.int64),
+        "scan_path_m": np.array([each.path_m for each in kept], dtype=np.float64),
+        "R_key_scan": np.reshape([each.T_key_scan.R for each in kept], (-1, 3, 3)),
+        "t_key_scan": np.reshape([each.T_key_scan.t for each in kept], (-1, 3)),
+        "points": np.concatenate(points),
+        "count": np.array([len(each.points) for each in kept], dtype=np.int64),
+    }
+
+
+def resume_loops(matcher: LoopMatcher, arrays: Arrays) -> None:
+    """Give a matcher what another one remembered."""
+    points = np.split(arrays["points"], np.cumsum(arrays["count"]))[:-1]
+    columns = (
+        arrays["key_pose"].tolist(),
+        map(RigidTransform, arrays["R_key_scan"], arrays["t_key_scan"]),
+        arrays["stamp_ns"].tolist(),
+        points,
+        arrays["scan_path_m"].tolist(),
+    )
+    kept = [KeptScan(*each) for each in zip(*columns, strict=True)]
+    path_m, last_m = arrays["path_m"].tolist()
+    matcher.resume(kept, path_m, last_m)
+
+
+def packed_one_field(state: OneFieldState) -> Arrays:
+    """Return a state as arrays."""
+    recorded = [each.recorded for each in state.key_poses if each.recorded is not None]
+    decisions = [[each.number, each.was_motion] for each in state.decisions]
+    arrays = {
+        **named("key_poses", packed_key_poses(state.key_poses)),
+        **named("recorded", packed_key_poses(recorded)),
+        "learnt_m": np.array([state.learnt_m]),
+        "decisions": np.reshape(np.array(decisions, dtype=np.int64), (-1, 2)),
+    }
+    if state.prior is not None:
+        arrays |= named("prior", _packed_prior(state.prior))
+    if state.beginning is not None:
+        arrays |= named("beginning", _packed_beginning(state.beginning))
+    return arrays
+
+
+def unpacked_one_field(arrays: Arrays) -> OneFieldState:
+    """Return the state of ``packed_one_field``."""
+    recorded = {each.number: each for each in unpacked_key_poses(under("recorded", arrays))}
+    key_poses = tuple(
+        replace(each, recorded=recorded.get(each.number))
+        for each in unpacked_key_poses(under("key_poses", arrays))
+    )
+    decisions = arrays["decisions"].tolist()
+    prior, beginning = under("prior", arrays), under("beginning", arrays)
+    return OneFieldState(
+        key_poses,
+        _unpacked_prior(prior) if prior else None,
+        _unpacked_beginning(beginning) if beginning else None,
+        float(arrays["learnt_m"][0]),
+        tuple(JumpDecision(number, bool(was_motion)) for number, was_motion in decisions),
+    )
+
+
+def _packed_beginning(beginning: SolvedBeginning) -> Arrays:
+    state = beginning.state
+    return {
+        **named("poses", packed_poses(beginning.poses)),
+        **{name: getattr(state, name) for name in STATE},
+        "recorded": np.array(sorted(beginning.recorded), dtype=np.int64),
+    }
+
+
+def _unpacked_beginning(arrays: Arrays) -> SolvedBeginning:
+    weights, distortion, steady, covariance = (arrays[name] for name in STATE)
+    poses = tuple(unpacked_poses(under("poses", arrays)))
+    # The last pose is the state's, and the likelihood counts readings from there on.
+    state = FilterState(poses[-1], weights, distortion, steady, covariance, 0.0)
+    return SolvedBeginning(poses, state, frozenset(arrays["recorded"].tolist()))
+
+
+def _packed_prior(prior: WholePrior) -> Arrays:
+    found = prior.spectrum
+    noise = found.noise
+    return {
+        "potential": np.array([found.prior.sigma, found.prior.length]),
+        "noise": np.array([noise.ut, noise.white, noise.slow_s]),
+        "correction": found.correction,
+        "log_likelihood": np.array([found.log_likelihood]),
+        "at": found.at,
+        "box": np.stack([prior.low, prior.high]),
+        "waves": np.array([prior.waves], dtype=np.int64),
+    }
+
+
+def _unpacked_prior(arrays: Arrays) -> WholePrior:
+    sigma, length = arrays["potential"].tolist()
+    spectrum = FieldSpectrum(
+        PotentialHyperparameters(sigma=sigma, length=length),
+        SensorNoise(*arrays["noise"].tolist()),
+        arrays["correction"],
+        float(arrays["log_likelihood"][0]),
+        arrays["at"],
+    )
+    low, high = arrays["box"]
+    return WholePrior(spectrum, low, high, int(arrays["waves"][0]))

@@ -17,24 +17,25 @@ from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.follower import Follower, LastBelief
 from l2m_gtsam.slam.online.intake import Intake, IntakeState
-from l2m_gtsam.slam.online.loop_matcher import LoopMatcher
 from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep
-from l2m_gtsam.slam.online.packed_loops import packed_loops, resume_loops
-from l2m_gtsam.slam.online.packed_one_field import packed_one_field, unpacked_one_field
 from l2m_gtsam.slam.online.packing import (
     Arrays,
     named,
     packed_drift,
     packed_gaussian,
     packed_key_poses,
+    packed_loops,
+    packed_one_field,
     packed_poses,
+    resume_loops,
     under,
     unpacked_drift,
     unpacked_gaussian,
     unpacked_key_poses,
+    unpacked_one_field,
     unpacked_poses,
 )
-from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
+from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanMatcher
 from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
 from l2m_gtsam.slam.online.session import OnlineSlam, StartSearchState
 from l2m_gtsam.slam.online.tracked_drift import TrackedDrift

@@ -27,7 +27,6 @@ from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.unknown_field.end_state import end_state
 from l2m_gtsam.slam.unknown_field.field_filter import DeadReckoning, FieldFilter, FilterState
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
     Hypotheses,
@@ -35,7 +34,7 @@ from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
     JumpDecision,
     step_of,
 )
-from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, SmoothedDrive, smoothed
+from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, SmoothedDrive, end_state, smoothed
 from l2m_gtsam.slam.unknown_field.whole_field import (
     COARSE,
     WholePrior,

@@ -1,18 +1,31 @@
-"""Tiles at an estimate of poses: whether later visits find the field of earlier ones."""
+"""Tiles at an estimate of poses: whether later visits find the field of earlier ones.
+
+Where they do not, steel was moved between them: as few sources as explain what tiles differ by.
+"""
 
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag, cholesky, solve_triangular
+from scipy.sparse import csr_array
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.sources.found_sources import FoundSources
+from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import place_readings
 from l2m_gtsam.slam.relative_motion import RelativeMotions
-from l2m_gtsam.slam.unknown_field.changed_visits import Seen, trusted
-from l2m_gtsam.slam.unknown_field.moved_sources import moved_steel
-from l2m_gtsam.slam.unknown_field.tile_visits import LIKELY, JudgedVisits, Visit, middle_of
+from l2m_gtsam.slam.unknown_field.changed_visits import Seen, VisitResiduals, trusted
+from l2m_gtsam.slam.unknown_field.tile_visits import (
+    LIKELY,
+    Change,
+    Judged,
+    JudgedVisits,
+    Visit,
+    middle_of,
+)
 from l2m_gtsam.slam.unknown_field.tiles import (
     Anchoring,
     FieldPrior,
@@ -20,11 +33,12 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     relative_place,
     visits_among,
 )
-from l2m_gtsam.slam.unknown_field.visit_graph import VisitGraph, ways_between
+from l2m_gtsam.slam.unknown_field.visit_graph import POSE, VisitGraph, ways_between
 
 KNOWN_M = 0.02  # standard deviation of a sensor's place, up to which tiles are judged
 MOST_CHANGED = 0.6  # share of the visits to known tiles, beyond which none is believed to have
 TIMES = 8  # the most times at which something is moved on a drive, and that visits are cut
+READINGS = 40  # of a visit: more say little more of steel that is metres away
 
 
 @dataclass(frozen=True)
@@ -194,3 +208,98 @@ def divided(anchoring: Anchoring, new: list[Visit]) -> Anchoring:
         tile[later] = len(anchors)
         anchors.append(int(visit.key_poses[0]))
     return Anchoring(np.array(anchors), tile)
+
+
+@dataclass(frozen=True)
+class MovedSteel:
+    """What was moved, and when.
+
+    Attributes
+    ----------
+    sources
+        That came or went, in the map.
+    change
+        When, as closely as it is known with them.
+    """
+
+    sources: FoundSources
+    change: Change
+
+    def sigma(self, points: FloatArray) -> float:
+        """Return the standard deviation of their field at points in the map, uT, (n, 3), rms."""
+        if not len(self.sources):
+            return 0.0
+        J = np.concatenate([each.derivatives(points) for each in self.sources.shapes], axis=2)
+        return float(np.sqrt(np.mean(np.sum((J @ self.sources.root) ** 2, axis=2))))
+
+
+def moved_steel(judged: JudgedVisits, change: Change) -> MovedSteel:
+    """Return sources that came or went at the time of a change.
+
+    Parameters
+    ----------
+    judged
+        Visits to known tiles.
+    change
+        When it was, as tiles that changed clearly show it.
+    """
+    after = judged.after(change)
+    found = np.array([judged.visits[k].gain > LIKELY for k in after])
+    rows = change_rows(judged, after)
+    sources = find_sources(rows, rows.points[found[rows.slot]], SourceSearchOptions(), None)
+    between = judged.during(change)
+    if not (len(sources) and between):
+        return MovedSteel(sources, change)
+    # The later of the visits between may show the sources: from which one on is likeliest?
+    rows = change_rows(judged, between)
+    field, middle = sources.field(rows.points), [judged.visits[k].visit.middle for k in between]
+    times = [change.begin, *middle, change.end]
+    left = [
+        rows.pull(rows.residual - field * (rows.slot >= first)[:, None])[1]
+        for first in range(len(between) + 1)
+    ]
+    first = int(np.argmin(left))
+    return MovedSteel(sources, Change(times[first], times[first + 1]))
+
+
+def change_rows(judged: JudgedVisits, numbers: tuple[int, ...]) -> MarginalRows:
+    """Return what visits differ from the earlier field by; each is a slot.
+
+    Where they were is known by all others.
+    """
+    visits = judged.visits
+    links = {k: (each.first, each.motion) for k, each in visits.items() if k not in numbers}
+    mean, covariance = judged.graph.solved(links).motions({k: visits[k].first for k in numbers})
+    means = mean.reshape(-1, POSE)
+    parts = [_rows_of(visits[k], judged.graph, means[n]) for n, k in enumerate(numbers)]
+    points, residual, whitening, nuisance = (list(each) for each in zip(*parts, strict=True))
+    return MarginalRows(
+        np.concatenate(points),
+        np.concatenate(residual),
+        csr_array(block_diag(*whitening)),
+        csr_array(block_diag(*nuisance)),
+        np.asarray(np.linalg.inv(covariance), dtype=np.float64),
+        np.repeat(np.arange(len(numbers)), [len(each) for each in points]),
+    )
+
+
+def _rows_of(
+    judged: Judged, graph: VisitGraph, mean: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return places and residuals of a visit in the map, their whitening and white derivatives."""
+    visit, seen = judged.visit, judged.visit.seen.thinned(READINGS)
+    own = VisitResiduals.of(visit.field, judged.earlier, seen, visit.T_anchor_node)
+    # A tile moves with the first visit of it.
+    T_map_anchor = graph.nodes[judged.first].compose(judged.T_anchor_first.inverse())
+    R, p = T_map_anchor.rotation().matrix(), T_map_anchor.translation()
+    F = own.features.reshape(3 * len(seen), -1) @ judged.earlier.axes
+    spread = (F * judged.earlier.variance) @ F.T + np.diag(seen.variance.ravel())
+    lower = cholesky(spread, lower=True)
+    D = own.by_motion.reshape(-1, POSE)
+    turned = np.kron(np.eye(len(seen)), R.T)
+    return (
+        seen.points @ R.T + p,
+        (own.left - own.by_motion @ mean) @ R.T,
+        solve_triangular(lower, turned, lower=True),
+        solve_triangular(lower, D, lower=True),
+    )

@@ -20,10 +20,9 @@ from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.odometry import scan_odometry
 from l2m_gtsam.slam.online.events import EventKind
-from l2m_gtsam.slam.online.loop_matcher import CONTRADICTS, LoopMatcher
 from l2m_gtsam.slam.online.replay import Message, give, messages, with_scans
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
-from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
+from l2m_gtsam.slam.online.scan_matching import CONTRADICTS, LoopMatcher, ScanMatcher
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, TileOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer

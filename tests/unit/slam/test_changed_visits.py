@@ -18,7 +18,7 @@ from l2m_gtsam.slam.unknown_field.changed_visits import (
     Seen,
     VisitResiduals,
 )
-from l2m_gtsam.slam.unknown_field.moved_sources import moved_steel
+from l2m_gtsam.slam.unknown_field.revisited_tiles import moved_steel
 from l2m_gtsam.slam.unknown_field.tile_visits import CLEAR, LIKELY, JudgedVisits, Visit
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile
 from l2m_gtsam.slam.unknown_field.visit_graph import VisitGraph, Way

@@ -14,10 +14,15 @@ from l2m_gtsam.slam.drive import EXACT_START
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
-from l2m_gtsam.slam.unknown_field import end_state as module
-from l2m_gtsam.slam.unknown_field.end_state import end_state
+from l2m_gtsam.slam.unknown_field import smoothed_drive as module
 from l2m_gtsam.slam.unknown_field.path_information import PathNeighbourhood, path_information
-from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, SmoothedDrive, smoothed, with_noise
+from l2m_gtsam.slam.unknown_field.smoothed_drive import (
+    ON_LINE,
+    SmoothedDrive,
+    end_state,
+    smoothed,
+    with_noise,
+)
 from l2m_gtsam.slam.unknown_field.whole_smoother import reported
 from l2m_gtsam.studies.slam.methods import as_recorded
 

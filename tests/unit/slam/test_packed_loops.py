@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import RigidTransform
 from l2m_gtsam.lidar.loop_closures import LoopOptions
-from l2m_gtsam.slam.online.loop_matcher import KeptScan, LoopMatcher
-from l2m_gtsam.slam.online.packed_loops import packed_loops, resume_loops
+from l2m_gtsam.slam.online.packing import packed_loops, resume_loops
+from l2m_gtsam.slam.online.scan_matching import KeptScan, LoopMatcher
 from l2m_gtsam.slam.options import DriftOptions
 
 
