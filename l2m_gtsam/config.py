@@ -17,7 +17,7 @@ from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
-from l2m_gtsam.text.shown import shown, shown_value
+from l2m_gtsam.text import shown, shown_value
 
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -12,7 +12,7 @@ from l2m_gtsam.api.results import JudgedCalibration
 from l2m_gtsam.data import KnownSensor, Recording
 from l2m_gtsam.errors import InputError
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.text.shown import shown, shown_value
+from l2m_gtsam.text import shown, shown_value
 
 READERS = {
     "recording": "read_bag",

@@ -15,7 +15,7 @@ from l2m_gtsam.storage.bag_report import POSE_FILE, BagReport, TopicReport
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.messages import ALL_POSE_TYPES, TF_TYPES
 from l2m_gtsam.storage.units import EARTH_UT, Unit
-from l2m_gtsam.text.shown import shown
+from l2m_gtsam.text import shown
 
 TRACKED = ("base_link", "lidar", "velodyne", "os_sensor", "base_footprint", "imu_link", "body")
 

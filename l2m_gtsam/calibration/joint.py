@@ -9,6 +9,7 @@ import numpy as np
 from l2m_factors import BatchedReadings
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.cluster_robust import Excess, scatters, unmodelled
+from l2m_gtsam.calibration.coverage import Correction
 from l2m_gtsam.calibration.determined import determinacies
 from l2m_gtsam.calibration.factor_graph import (
     Estimate,
@@ -19,7 +20,6 @@ from l2m_gtsam.calibration.factor_graph import (
 )
 from l2m_gtsam.calibration.half_difference import HalfDifference
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
-from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.optimise import (
     NEARLY,
     TOLERANCE,

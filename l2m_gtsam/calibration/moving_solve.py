@@ -12,8 +12,8 @@ import numpy as np
 
 from l2m_factors import PoseMotion, field_rate
 from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.coverage import Correction
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.trust import FEWEST

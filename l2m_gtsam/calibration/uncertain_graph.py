@@ -17,7 +17,7 @@ from l2m_factors import (
 )
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
-from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
+from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover, moving_fields
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
 from l2m_gtsam.calibration.group_noise import group_noise
 from l2m_gtsam.calibration.joint_information import (
@@ -27,7 +27,6 @@ from l2m_gtsam.calibration.joint_information import (
     joint_information,
     rows_of_factors,
 )
-from l2m_gtsam.calibration.moving_fields import moving_fields
 from l2m_gtsam.calibration.optimise import (
     NEARLY,
     TOLERANCE,

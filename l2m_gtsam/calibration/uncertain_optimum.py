@@ -14,7 +14,7 @@ from l2m_gtsam.calibration.budget.processes import Process, ReadingPlaces, Warp
 from l2m_gtsam.calibration.budget.search import ProcessInformation, process_information
 from l2m_gtsam.calibration.budget.unseen_warp import UnseenWarp
 from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
-from l2m_gtsam.calibration.coverage import Coverage
+from l2m_gtsam.calibration.coverage import Correction, Coverage
 from l2m_gtsam.calibration.half_difference import (
     JUDGED,
     HalvedSensor,
@@ -24,7 +24,6 @@ from l2m_gtsam.calibration.half_difference import (
 )
 from l2m_gtsam.calibration.joint import SensorSolution, with_infinities
 from l2m_gtsam.calibration.joint_information import JointInformation, Rows, columns_at
-from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.optimise import joint_covariance
 from l2m_gtsam.calibration.parts_alone import ByParts, by_parts
 from l2m_gtsam.calibration.priors import contradictions

@@ -12,7 +12,7 @@ from types import FrameType
 import typer
 
 from l2m_gtsam.errors import L2MError
-from l2m_gtsam.text.shown import shown
+from l2m_gtsam.text import shown
 
 USER, FAULT, SIGNAL = 2, 70, 128  # exit codes: 70 is that of sysexits.h for internal errors
 LOST = "standard output: cannot be written: "

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
-from l2m_gtsam.text.shown import shown
+from l2m_gtsam.text import shown
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.exponential import FAST, LEAST, exponentiate
-from l2m_gtsam.maps.posterior import Posterior, scaled
+from l2m_gtsam.maps.posterior import FAST, LEAST, Posterior, exponentiate, scaled
 
 
 @dataclass(frozen=True)

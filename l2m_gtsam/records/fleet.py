@@ -12,7 +12,7 @@ from pydantic import Field
 
 from l2m_gtsam.records.metrics import Row
 from l2m_gtsam.records.record import Record
-from l2m_gtsam.text.rounded import significant
+from l2m_gtsam.text import significant
 
 VERDICTS = ("pass", "warn", "fail")
 """On a sensor."""

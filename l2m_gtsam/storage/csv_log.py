@@ -20,7 +20,7 @@ from l2m_gtsam.storage.field_types import CSV_FIELD_TYPE
 from l2m_gtsam.storage.files import open_text
 from l2m_gtsam.storage.log import TableLog, TableTopic
 from l2m_gtsam.storage.messages import CSV_POSE_TYPE, Orientation, Position
-from l2m_gtsam.text.shown import shown
+from l2m_gtsam.text import shown
 
 NS_PER = {
     TimeUnit.SECONDS: 1_000_000_000,

@@ -32,7 +32,7 @@ from l2m_gtsam.storage.rosbags_bounds import (
     check_names,
     check_sizes,
 )
-from l2m_gtsam.text.shown import shown
+from l2m_gtsam.text import shown
 
 bound_rosbags()
 

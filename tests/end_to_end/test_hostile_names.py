@@ -27,7 +27,7 @@ from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.files import folder_names, printable
 from l2m_gtsam.storage.fleet_table import write_csv
 from l2m_gtsam.storage.record_files import read_metrics
-from l2m_gtsam.text.shown import shown_lines
+from l2m_gtsam.text import shown_lines
 from tests.drives.bags import Entry, ros, write
 from tests.drives.degenerate import eight, mounted
 from tests.drives.fleet_rows import row

@@ -19,7 +19,7 @@ from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.record_files import read_slam
 from l2m_gtsam.storage.trajectory_files import write_tum
-from l2m_gtsam.text.rounded import significant
+from l2m_gtsam.text import significant
 from tests.drives.calibrations import calibration, sensor
 from tests.drives.yard import calibrated_yard
 from tests.support.command_line import complaint_here, l2m

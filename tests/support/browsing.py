@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from l2m_gtsam.batch.reports import find_browser
-from l2m_gtsam.text.shown import shown_lines
+from l2m_gtsam.text import shown_lines
 from tests.drives.hostile import NAMES
 
 PROGRAMS = Path(__file__).parents[1] / "browser"

@@ -7,7 +7,7 @@ from rich import box
 from rich.table import Table
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.text.rounded import entries_by_sigma, sigma_entries
+from l2m_gtsam.text import entries_by_sigma, sigma_entries
 
 TEXT_WIDTH = 18  # the least of a column of text that breaks where it must
 OPEN = "-"  # what is not determined

@@ -15,7 +15,7 @@ from l2m_gtsam.records.calibration import (
     TimeOffset,
 )
 from l2m_gtsam.records.sensor_models import Model, ModelComparison, ModelFigures, MovingField
-from l2m_gtsam.text.rounded import significant, with_sigma
+from l2m_gtsam.text import significant, with_sigma
 
 HEADINGS = (
     "t_lidar_mag (m)",

@@ -9,7 +9,7 @@ from rich.table import Table
 from l2m_gtsam.cli.tables import add_numbers, add_text, new_table, plain_table, sigmas_cell
 from l2m_gtsam.records.plan import DrivePlan, SensorPlan, Worst
 from l2m_gtsam.storage.bag_report import BagReport, TopicReport
-from l2m_gtsam.text.rounded import in_unit, sigma_alone
+from l2m_gtsam.text import in_unit, sigma_alone
 
 HEADINGS = ("± t (mm)", "± H (uT)", "± rotation (deg)", "± clock (ms)")
 OTHERS = ("± C by column", "assumed t (m)", "readings", "outside map")

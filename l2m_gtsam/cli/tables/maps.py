@@ -11,7 +11,7 @@ from l2m_gtsam.cli.tables import add_numbers, add_text, plain_table, vector_cell
 from l2m_gtsam.maps.compare import KindFigures, KindResult, MapComparison
 from l2m_gtsam.qa.report.facts import period
 from l2m_gtsam.records.map_diary import MapDiary, between, doubtful, words_of
-from l2m_gtsam.text.rounded import by_sigma, sigma_alone
+from l2m_gtsam.text import by_sigma, sigma_alone
 
 HEADINGS = (
     "log-likelihood",

@@ -9,7 +9,7 @@ from l2m_gtsam.cli.tables import new_table
 from l2m_gtsam.geometry import to_ros
 from l2m_gtsam.records.localisation import Gain, LocalisationResult, ScanUse, StartSearch
 from l2m_gtsam.records.localisation_file import TruthRecord
-from l2m_gtsam.text.rounded import significant
+from l2m_gtsam.text import significant
 
 MOST_EVENTS = 20  # that are printed
 

@@ -13,7 +13,7 @@ from l2m_gtsam.records.validation import (
     ValidatedSensor,
 )
 from l2m_gtsam.records.verdict import Verdict
-from l2m_gtsam.text.rounded import significant, with_sigma
+from l2m_gtsam.text import significant, with_sigma
 
 
 def validation_table(drive: DriveValidation, verdict: Verdict) -> Table:

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.sparse import csr_array, tril
 
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.harmonic.evidence import SharedNoise
 from l2m_gtsam.maps.harmonic.learnt import Learnt
-from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.survey_poses import ErrorKnots, SurveyPoses
 from l2m_gtsam.parallel.threads import in_threads

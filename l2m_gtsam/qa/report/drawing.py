@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.qa.report.svg import GRID, INK, MUTED, SMALL, VARIABLES, WIDTH, as_svg
-from l2m_gtsam.text.shown import shown_lines
+from l2m_gtsam.text import shown_lines
 
 STEPS = [1, 2, 2.5, 5, 10]
 TICK = 3.5  # points

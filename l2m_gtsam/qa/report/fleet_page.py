@@ -18,7 +18,7 @@ from l2m_gtsam.qa.report.figures.trends import SIGMAS, Trend, trend_figure, tren
 from l2m_gtsam.qa.report.page import Picture, own_file, render, roll_pitch_yaw
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.records.fleet import ERROR, FleetRow, SensorRow
-from l2m_gtsam.text.rounded import by_sigma, sigma_alone, with_sigma
+from l2m_gtsam.text import by_sigma, sigma_alone, with_sigma
 
 REPORT = "report.html"  # in the folder of each drive
 

@@ -15,7 +15,7 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.qa.metrics.plain import evenly
 from l2m_gtsam.qa.report.drawing import Drawing, Panel
 from l2m_gtsam.qa.report.svg import hover_name
-from l2m_gtsam.text.shown import shown_lines
+from l2m_gtsam.text import shown_lines
 
 MOST = 64  # parts of a figure: about two millimetres of its width each
 REACH = 4.5  # points around a place

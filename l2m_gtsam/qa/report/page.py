@@ -18,16 +18,16 @@ from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.svg import as_svg
 from l2m_gtsam.records.metrics import Row
 from l2m_gtsam.storage.report_id import SHOWN
-from l2m_gtsam.text.rounded import (
+from l2m_gtsam.text import (
     by_sigma,
     limit,
+    shown_lines,
     sigma_alone,
     significant,
     vector_by_sigma,
     vector_of_sigmas,
     with_sigma,
 )
-from l2m_gtsam.text.shown import shown_lines
 
 TURN = 1e-5  # rad, of central differences
 

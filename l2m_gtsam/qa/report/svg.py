@@ -20,7 +20,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.storage.files import atomic_path
-from l2m_gtsam.text.shown import shown, shown_lines
+from l2m_gtsam.text import shown, shown_lines
 
 # Placeholders for variables of the page's style, so that a figure follows light and dark.
 INK, MUTED, GRID, PAPER = "#010203", "#040506", "#070809", "#0a0b0c"

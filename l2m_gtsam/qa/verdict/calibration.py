@@ -32,7 +32,7 @@ from l2m_gtsam.records.calibration import (
 from l2m_gtsam.records.error_budget import DurationSource
 from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
-from l2m_gtsam.text.rounded import significant
+from l2m_gtsam.text import significant
 
 OPEN = (SensorStatus.UNDETERMINED, SensorStatus.NOT_CONVERGED, SensorStatus.NO_READINGS)
 LOWER_BOUNDS = (

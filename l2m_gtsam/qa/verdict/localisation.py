@@ -18,7 +18,7 @@ from l2m_gtsam.records.localisation_file import (
 )
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Threshold, Verdict
 from l2m_gtsam.solve.chi_square import chance_beyond
-from l2m_gtsam.text.rounded import with_sigma
+from l2m_gtsam.text import with_sigma
 
 SHARED_LIMITS = ("rejected", "outside_map", "chi_square")
 MANY = 3  # stretches that are listed one by one

@@ -5,7 +5,7 @@ import numpy as np
 from l2m_gtsam.records.calibration import Disagreement, Return
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
 from l2m_gtsam.records.verdict import Level, Reason
-from l2m_gtsam.text.rounded import sigma_alone, significant, vector_by_sigma, with_sigma
+from l2m_gtsam.text import sigma_alone, significant, vector_by_sigma, with_sigma
 
 CAUSES = {
     Cause.PLACE: "the place changed",

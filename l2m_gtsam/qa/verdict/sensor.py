@@ -16,7 +16,7 @@ from l2m_gtsam.records.calibration import (
 )
 from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Level, Reason
-from l2m_gtsam.text.rounded import by_sigma, sigma_alone, significant
+from l2m_gtsam.text import by_sigma, sigma_alone, significant
 
 OPEN_HEAD = "Not everything can be known"
 HEADS = {

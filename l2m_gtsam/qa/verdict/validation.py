@@ -17,7 +17,7 @@ from l2m_gtsam.records.validation import (
     ValidatedSensor,
 )
 from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict
-from l2m_gtsam.text.rounded import in_unit, significant, with_sigma
+from l2m_gtsam.text import in_unit, significant, with_sigma
 
 SHARED_LIMITS = ("unexplained", "rejected", "outside_map", "saturated")
 EXPECTED_TIMES = 2.0  # a refit that leaves no more than this of what is expected fits the map

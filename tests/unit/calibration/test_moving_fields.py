@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from l2m_factors import Q, shared_error
-from l2m_gtsam.calibration.moving_fields import Correction, MovingFields, moving_fields
+from l2m_gtsam.calibration.coverage import Correction, MovingFields, moving_fields
 from l2m_gtsam.calibration.moving_solve import without
 from l2m_gtsam.data import FloatArray, Readings
 

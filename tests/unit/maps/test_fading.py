@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.evidence import Normal, condition, evidence
-from l2m_gtsam.maps.harmonic.fading import carried, faded, likelihood, share_left
+from l2m_gtsam.maps.harmonic.tile_sums import carried, faded, likelihood, share_left
 
 NOISE = 0.3
 SEEDS = st.integers(0, 10_000)

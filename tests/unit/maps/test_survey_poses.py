@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import map_from_state
-from l2m_gtsam.maps.harmonic.evidence import condition, evidence, normal_of
+from l2m_gtsam.maps.harmonic.evidence import SharedNoise, condition, evidence, normal_of
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.pose_sizes import MOST_READINGS, pose_view
 from l2m_gtsam.maps.harmonic.search import SearchOptions
-from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 from l2m_gtsam.maps.harmonic.tile_correlation import shared_poses, within_whole
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors

@@ -26,7 +26,7 @@ from l2m_gtsam.solve.model_comparison import (
     segments_of,
 )
 from l2m_gtsam.solve.model_fits import Fit, Solution, Spread, compress, fit_model
-from l2m_gtsam.text.rounded import with_sigma
+from l2m_gtsam.text import with_sigma
 from tests.drives.model import NOISE, Setting, drawn
 
 NOTHING = Coefficients(np.zeros((3, 3)), np.zeros(3), np.zeros((0, 3)), np.zeros((3, 3)))

@@ -24,7 +24,7 @@ from l2m_gtsam.qa.report.svg import (
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.metrics import Repeatability
 from l2m_gtsam.records.validation import ValidatedSensor
-from l2m_gtsam.text.rounded import with_sigma
+from l2m_gtsam.text import with_sigma
 
 MANY = 12  # drives beyond which only some are numbered
 ROW = 0.26  # inches of a sensor

@@ -23,7 +23,7 @@ from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, PAPER, SMALL, X, Y
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.metrics import Normalised, Row, SensorMetrics
 from l2m_gtsam.solve.chi_square import density
-from l2m_gtsam.text.rounded import with_sigma
+from l2m_gtsam.text import with_sigma
 
 CUT = 7.81  # 95 % of chi-square of three
 ALIKE = 3.0  # sigmas: of fifteen parameters one is beyond in 4 % of all drives

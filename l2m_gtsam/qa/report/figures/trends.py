@@ -15,7 +15,7 @@ from l2m_gtsam.qa.fleet import by_sensor
 from l2m_gtsam.qa.report.hover import axes_strips
 from l2m_gtsam.qa.report.svg import AXES, BAD, INK, MUTED, dots, plain_figure
 from l2m_gtsam.records.fleet import DATE, FleetRow
-from l2m_gtsam.text.rounded import with_sigma
+from l2m_gtsam.text import with_sigma
 
 SIGMAS = 2  # of the bars
 ROOM = 1.15  # around what is drawn

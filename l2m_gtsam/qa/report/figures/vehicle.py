@@ -25,7 +25,7 @@ from l2m_gtsam.qa.report.svg import (
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import MapPicture
 from l2m_gtsam.records.verdict import Level, Verdict
-from l2m_gtsam.text.rounded import with_sigma
+from l2m_gtsam.text import with_sigma
 
 SIGMAS_95 = 5.991**0.5  # half axes that hold 95 %: root of the quantile of chi-square of two
 ESTIMATE, TRUTH = "#d55e00", "black"  # vermilion and black differ for all kinds of colour vision

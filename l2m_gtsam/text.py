@@ -1,17 +1,27 @@
-"""Numbers as a person reads them: as many digits as their standard deviation leaves.
+"""Text as a person reads it: numbers with the digits that they deserve, and what others wrote.
 
 A standard deviation has two significant digits, its value ends at the same decimal, and zeros at
 the end stay. Entries of a vector end at one decimal, that of the smallest. Exponents are for what
 is below 1e-5 or above 1e7 only.
+
+Names of topics, frames, sensors and files come from bags and file systems. Shown as they are, they
+would move the cursor, change colours or turn the direction of the text around them: here is the one
+place that makes them fit to be shown.
 """
 
+import unicodedata
 from collections.abc import Iterable
 from math import inf, isfinite
+from typing import Any
 
 OF_SIGMA = 2  # significant digits of a standard deviation
 LEAST, MOST = -5, 7  # decades between which no number has an exponent
 NONE = "–"
 OPEN = "not determined"
+LONGEST_LINE = 2000  # letters of a message; the longest of ours list the sensors of a vehicle
+LONGEST_VALUE = 80  # letters of a value in a message
+# Control characters, those that change the direction of others, lone surrogates, ends of lines.
+HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 def significant(value: float, digits: int = 3) -> str:
@@ -120,3 +130,53 @@ def _ending_at(value: float, places: int) -> str:
     if not LEAST <= decade < MOST:
         return f"{rounded:.{max(decade + places, 0)}e}"
     return f"{rounded:.{max(places, 0)}f}"
+
+
+def shown(text: str, longest: int | None = LONGEST_LINE) -> str:
+    """Return text with control characters in words, and not longer than so many letters.
+
+    Parameters
+    ----------
+    text
+        Any text.
+    longest
+        Letters; what lies between the beginning and the end of a longer text is left out. None
+        leaves nothing out.
+    """
+    if longest is not None and len(text) > longest:
+        half = longest // 2
+        text = f"{text[: longest - half]} … {text[-half:]}"
+    if text.isprintable():
+        return text
+    return "".join(_in_words(each) if _is_hidden(each) else each for each in text)
+
+
+def shown_lines(text: str) -> str:
+    """Return text whose lines are as ``shown`` has them, in full."""
+    return text if text.isprintable() else "\n".join(shown(line, None) for line in text.split("\n"))
+
+
+def shown_value(value: Any) -> str:
+    """Return a value as Python writes it, within ``LONGEST_VALUE`` letters and with few steps.
+
+    A number of thousands of digits, or a list of lists of lists, is described by its kind.
+    """
+    if isinstance(value, str):
+        return shown(repr(value[: LONGEST_VALUE + 1]), LONGEST_VALUE)
+    if value is None or isinstance(value, bool | float):
+        return repr(value)
+    if isinstance(value, int):
+        return repr(value) if abs(value) < 10**LONGEST_VALUE else "a number of many digits"
+    if isinstance(value, list | tuple | set | frozenset):
+        return f"a list of {len(value)}"
+    if isinstance(value, dict):
+        return f"a table of {len(value)}"
+    return shown(type(value).__name__, LONGEST_VALUE)
+
+
+def _is_hidden(letter: str) -> bool:
+    return unicodedata.category(letter) in HIDDEN
+
+
+def _in_words(letter: str) -> str:
+    return letter.encode("unicode_escape").decode("ascii")

@@ -1,1 +1,0 @@
-"""Text that strangers wrote, on its way to screens and pictures."""
