@@ -51,7 +51,7 @@ def sigma_alone(sigma: float) -> str:
     return significant(sigma, OF_SIGMA) if places is None else _ending_at(sigma, places)
 
 
-def by_sigma(value: float, sigma: float, *, signed: bool = False) -> str:
+def by_sigma(value: float, sigma: float, unit: str = "", *, signed: bool = False) -> str:
     """Return a value that ends where its standard deviation does; "not determined" if infinite.
 
     What is exact, with a standard deviation of zero, has at most six significant digits.
@@ -60,7 +60,7 @@ def by_sigma(value: float, sigma: float, *, signed: bool = False) -> str:
         return OPEN
     places = _places(sigma)
     text = f"{value:g}" if places is None else _ending_at(value, places)
-    return f"+{text}" if signed and not text.startswith("-") else text
+    return in_unit(f"+{text}" if signed and not text.startswith("-") else text, unit)
 
 
 def with_sigma(value: float, sigma: float, unit: str = "", *, signed: bool = False) -> str:

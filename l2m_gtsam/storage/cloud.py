@@ -11,7 +11,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError, OutputError
-from l2m_gtsam.storage.bounded_zip import ArrayMember, open_archive, opened_array
+from l2m_gtsam.storage.bounded import ArrayMember, open_archive, opened_array
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.point_table import (
     PIECE_POINTS,

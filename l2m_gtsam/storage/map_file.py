@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from l2m_gtsam.data import LidarMap, MapState
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.storage.bounded_zip import open_archive, read_stored_array
+from l2m_gtsam.storage.bounded import open_archive, read_stored_array
 from l2m_gtsam.storage.files import atomic_path
 
 FORMAT = "l2m-map"

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Trajectory
 from l2m_gtsam.geometry import from_ros
-from l2m_gtsam.storage.number_ranges import odd_poses, readable
 from l2m_gtsam.storage.tf import Link
-from l2m_gtsam.storage.units import Unit
+from l2m_gtsam.storage.units import Unit, odd_poses, readable
 
 SIZE = 36
 # Asymmetry and negative eigenvalues that rounding explains, also in single precision, relative

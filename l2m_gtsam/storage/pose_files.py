@@ -14,7 +14,7 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bag_options import ColumnOptions, PoseFileOptions
 from l2m_gtsam.storage.csv_log import read_table
 from l2m_gtsam.storage.files import open_text
-from l2m_gtsam.storage.number_ranges import odd_poses
+from l2m_gtsam.storage.units import odd_poses
 
 NANOSECONDS = 1_000_000_000
 COLUMNS, KITTI_COLUMNS = 8, 12

@@ -22,9 +22,9 @@ from l2m_gtsam.records.record import Record, fields_of
 from l2m_gtsam.records.validation import Validation
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
-from l2m_gtsam.storage.number_ranges import odd_poses
 from l2m_gtsam.storage.report_id import checked_id, report_id
 from l2m_gtsam.storage.result_set import check_set
+from l2m_gtsam.storage.units import odd_poses
 
 MAX_BYTES = 100_000_000  # figures of a hundred sensors are some megabytes
 MAX_OUTCOME_BYTES = 10_000_000  # a hundred sensors are some 100 kB

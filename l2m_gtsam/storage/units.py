@@ -1,7 +1,8 @@
-"""Units of readings: named or as a number, and whether a field strength fits its unit.
+"""Units of readings, named or as a number, and whether numbers fit them.
 
 Anywhere on Earth, also near steel, a field is 10 to 200 uT strong. Drivers publish gauss,
-microtesla, raw counts or bare directions under the name of tesla; the strength reveals it.
+microtesla, raw counts or bare directions under the name of tesla; the strength reveals it. Other
+numbers no pose and no reading has: those of a damaged message, or in another unit.
 """
 
 from dataclasses import dataclass
@@ -20,6 +21,10 @@ CONSTANT = 1e-6
 ENOUGH_READINGS = 20
 # Readings that differ by less, relative, are a sensor at rest, whatever its rounding.
 TURNED = 1e-3
+# Drivers round quaternions, in single precision or to a few digits; none is off by more than this.
+QUATERNION_LENGTH = (0.5, 2.0)
+# Further than any place of the Earth from another one: the unit is wrong, or the number is.
+MOST_METRES = 1e8
 
 
 class Unit(StrEnum):
@@ -197,3 +202,43 @@ def _suspicion(as_written: float) -> str:
 
 def _distance(field_ut: float) -> float:
     return float(abs(np.log(field_ut / EARTH_UT)))
+
+
+def odd_orientation(quaternion: FloatArray) -> str:
+    """Return what is wrong with quaternions, shape (N, 4); nothing if all are rotations."""
+    if np.any(~quaternion.any(axis=1)):
+        return "an orientation is all zero, it must be a unit quaternion"
+    # Of large numbers the squares are infinite: the largest component bounds the length, too.
+    largest = np.abs(quaternion).max(axis=1)
+    sound = (largest > QUATERNION_LENGTH[0] / 2) & (largest <= QUATERNION_LENGTH[1])
+    length = np.linalg.norm(quaternion[sound], axis=1)
+    inside = (length >= QUATERNION_LENGTH[0]) & (length <= QUATERNION_LENGTH[1])
+    if sound.all() and inside.all():
+        return ""
+    worst = quaternion[~sound][0] if not sound.all() else quaternion[sound][~inside][0]
+    return (
+        f"an orientation is ({', '.join(f'{each:.3g}' for each in worst)}), it must be a unit "
+        "quaternion"
+    )
+
+
+def odd_position(p: FloatArray) -> str:
+    """Return what is wrong with positions in metres, shape (N, 3); nothing if all can be."""
+    furthest = float(np.abs(p).max(initial=0.0))
+    if furthest <= MOST_METRES:
+        return ""
+    return f"a position has a coordinate of {furthest:.3g} m, at most {MOST_METRES:g} m can be"
+
+
+def odd_poses(p: FloatArray, quaternion: FloatArray) -> str:
+    """Return what is wrong with poses, shapes (N, 3) and (N, 4); nothing if all can be."""
+    return odd_orientation(quaternion) or odd_position(p)
+
+
+# No sensor reads as much in any unit, counts included; squares of what is left are finite.
+MOST_WRITTEN = 1e18
+
+
+def readable(written: FloatArray) -> FloatArray:
+    """Return readings as written with NaN in place of numbers that no sensor reads, (N, 3)."""
+    return np.where(np.abs(written) <= MOST_WRITTEN, written, np.nan)

@@ -22,9 +22,8 @@ from l2m_gtsam.maps.field_map import check_frame
 from l2m_gtsam.maps.sources.changed_map import ChangedMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
-from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
+from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, drive_metrics, map_picture
 from l2m_gtsam.qa.metrics.changes import is_calibrated
-from l2m_gtsam.qa.metrics.coverage import drive_metrics
 from l2m_gtsam.recording.drive_trace import is_of
 from l2m_gtsam.recording.saturation import saturation_sentence
 from l2m_gtsam.recording.sync import stuck_sensors

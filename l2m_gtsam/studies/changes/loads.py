@@ -11,7 +11,6 @@ from pydantic import Field
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.maps.build import build_map
-from l2m_gtsam.simulate.brought_steel import brought_steel
 from l2m_gtsam.simulate.hall_drives import calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import (
     HALF_AREA,
@@ -22,7 +21,7 @@ from l2m_gtsam.simulate.steel_hall import (
     hall_cloud,
     steel_hall,
 )
-from l2m_gtsam.simulate.world import SteelWorld
+from l2m_gtsam.simulate.world import SteelWorld, brought_steel
 from l2m_gtsam.studies.validation.drives import ValidationStudyOptions, direction
 
 

@@ -26,7 +26,7 @@ from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.measured import MeasuredWork, measured
 from l2m_gtsam.studies.peers.fixed_lag import FixedLagOptions, fixed_lag_slam
-from l2m_gtsam.studies.peers.particle_slam import ParticleSlamOptions, particle_slam
+from l2m_gtsam.studies.peers.particle_filters import ParticleSlamOptions, particle_slam
 from l2m_gtsam.studies.peers.reduced_rank_ekf import (
     POSE,
     FilteredPath,

@@ -17,7 +17,7 @@ from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.measured import measured
 from l2m_gtsam.studies.peers.exact_loops import closed_by_exact_loops
-from l2m_gtsam.studies.peers.map_particles import MapParticlesOptions, map_particles
+from l2m_gtsam.studies.peers.particle_filters import MapParticlesOptions, map_particles
 from l2m_gtsam.studies.slam.methods import MethodRow, followed, rms
 from l2m_gtsam.studies.slam.recordings import parts_of
 from l2m_gtsam.studies.slam_array.places import PLACES, Drift, DriveInMap, strengths

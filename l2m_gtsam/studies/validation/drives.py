@@ -22,10 +22,9 @@ from l2m_gtsam.data import (
 from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.simulate.brought_steel import brought_steel, place_beside
 from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
-from l2m_gtsam.simulate.world import SteelWorld
+from l2m_gtsam.simulate.world import SteelWorld, brought_steel, place_beside
 from l2m_gtsam.studies.honesty.drives import drive_seed
 
 

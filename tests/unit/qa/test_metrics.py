@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.qa.metrics.coverage import sphere
+from l2m_gtsam.qa.metrics.assemble import sphere
 from l2m_gtsam.qa.metrics.evidence import cross
 from l2m_gtsam.qa.metrics.fit import correlation, lasting
 from l2m_gtsam.qa.metrics.mounting import axis_order, gains, skews_deg

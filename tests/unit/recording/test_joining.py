@@ -22,7 +22,7 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.errors import CalibrationError, SyncError
-from l2m_gtsam.qa.metrics.coverage import drive_metrics
+from l2m_gtsam.qa.metrics.assemble import drive_metrics
 from l2m_gtsam.qa.metrics.fit import correlation
 from l2m_gtsam.recording.joining import drive_at, joined, own_ns
 from l2m_gtsam.recording.sync import stuck_readings, with_offsets

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from l2m_gtsam.simulate.brought_steel import brought_steel, place_beside
+from l2m_gtsam.simulate.world import brought_steel, place_beside
 
 MOMENT = np.array([3.0, -2.0, 7.0])
 

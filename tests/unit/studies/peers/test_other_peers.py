@@ -15,7 +15,7 @@ from l2m_gtsam.studies.peers.fixed_lag import (
     fixed_lag_slam,
     reading_of_field,
 )
-from l2m_gtsam.studies.peers.particle_slam import (
+from l2m_gtsam.studies.peers.particle_filters import (
     ParticleSlamOptions,
     moments,
     particle_slam,
