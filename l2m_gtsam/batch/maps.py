@@ -19,8 +19,7 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.map_diary import MapDiary
 from l2m_gtsam.records.provenance import MapOrigin
 from l2m_gtsam.storage.map_file import save_map
-from l2m_gtsam.upkeep.dated_changes import drive_dates
-from l2m_gtsam.upkeep.kept_map import kept_up
+from l2m_gtsam.upkeep.kept_map import drive_dates, kept_up
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from l2m_gtsam.lidar.surface import Surface, library
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress, silent
-from l2m_gtsam.qa.metrics.pose_errors import ComparedTrajectories, check_truth, truth_record
+from l2m_gtsam.qa.metrics.trajectory import ComparedTrajectories, check_truth, truth_record
 from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import TruthRecord

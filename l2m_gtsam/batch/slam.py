@@ -22,7 +22,7 @@ from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.qa.metrics.pose_errors import check_truth
+from l2m_gtsam.qa.metrics.trajectory import check_truth
 from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.qa.verdict.localisation import judgement_of_localisation
 from l2m_gtsam.recording.odometry_jumps import without_jumps

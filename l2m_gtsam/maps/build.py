@@ -8,7 +8,7 @@ from pydantic import field_validator
 from l2m_gtsam.data import FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.bilinear.bilinear_map import BilinearMap
-from l2m_gtsam.maps.bilinear.cells import BilinearOptions
+from l2m_gtsam.maps.bilinear.lattice import BilinearOptions
 from l2m_gtsam.maps.dense_gp import DenseGP, DenseGPOptions
 from l2m_gtsam.maps.field_map import FieldMap, framed
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap

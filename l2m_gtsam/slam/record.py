@@ -18,7 +18,7 @@ from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.fit import curves, fit_figures, normalised_figures, series
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.qa.metrics.pose_errors import ComparedTrajectories, truth_record
+from l2m_gtsam.qa.metrics.trajectory import ComparedTrajectories, truth_record
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import (
     LocalisationResult,

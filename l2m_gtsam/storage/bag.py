@@ -1,8 +1,10 @@
 """Read a drive out of a bag: the lidar's poses and every magnetometer's readings."""
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Connection
@@ -30,7 +32,6 @@ from l2m_gtsam.storage.messages import (
 )
 from l2m_gtsam.storage.open_bag import Bag
 from l2m_gtsam.storage.open_log import open_log
-from l2m_gtsam.storage.path_topic import path_trajectory
 from l2m_gtsam.storage.pose_files import read_poses
 from l2m_gtsam.storage.selection import select_fields, select_poses, sensor_names, several_frames
 from l2m_gtsam.storage.tf import Link, chain_frames, compose
@@ -326,3 +327,63 @@ def _series(path: Path, name: str, buffer: FieldBuffer, options: BagOptions) -> 
         raise UnitsError(f"{path}: topic {buffer.topic}: {wrong}")
     values = options.in_order(name, written * microtesla_per(options.units, buffer.unit))
     return FieldSeries(name, buffer.topic, buffer.frame, stamps, values)
+
+
+def path_trajectory(bag: Bag, paths: Sequence[Connection], progress: Count | None) -> Trajectory:
+    """Return the poses of all paths on a topic; of those with one stamp the latest message's.
+
+    A path that grows repeats all poses in each message, as corrected by loop closures: the last
+    message then has all of them. Of one that slides along, each message has some.
+
+    Parameters
+    ----------
+    bag
+        The log.
+    paths
+        Connections with `nav_msgs/Path`.
+    progress
+        Called with the messages read and their number.
+
+    Raises
+    ------
+    BagError
+        There is no path, it is a plan, or its poses are not usable.
+    """
+    latest: dict[int, Any] = {}
+    frames: set[str] = set()
+    for content in _grown(bag, paths, progress) or _contents(bag, paths, progress):
+        frames.add(frame_of(content))
+        stamps = [header_ns(each) for each in content.poses]
+        if len(set(stamps)) < min(len(stamps), 2):
+            raise BagError(
+                f"{bag.path}: the poses of a path on {paths[0].topic} have one stamp: it says "
+                "where a vehicle shall go, not where it was; choose another topic with `bag.poses`"
+            )
+        latest.update(zip(stamps, content.poses, strict=True))
+    if len(frames) > 1:
+        raise BagError(f"{bag.path}: paths in several frames: {', '.join(sorted(frames)[:10])}")
+    if not latest or not frames:
+        raise BagError(f"{bag.path}: the topic of the poses has no poses")
+    buffer = PoseBuffer(frames.pop(), "lidar")
+    for stamp_ns, stamped in sorted(latest.items()):
+        buffer.add(stamp_ns, stamped.pose.position, stamped.pose.orientation)
+    return buffer.trajectory()
+
+
+def _contents(bag: Bag, paths: Sequence[Connection], progress: Count | None) -> Iterator[Any]:
+    return (message.content for message in bag.messages(paths, progress))
+
+
+def _grown(bag: Bag, paths: Sequence[Connection], progress: Count | None) -> list[Any]:
+    """Return the last path alone if it has all that the first has; decoding all takes N^2 poses."""
+    codecs = {c.id: bag.codec(c) for c in paths}
+    first, last = None, None
+    for raw in bag.raw_messages(paths, progress):
+        first, last = first or raw, raw
+    if first is None or last is None:
+        return []
+    begun = codecs[first.connection.id].decode(first.data)
+    ended = codecs[last.connection.id].decode(last.data)
+    if not begun.poses or len(ended.poses) < len(begun.poses):
+        return []
+    return [ended] if header_ns(ended.poses[0]) <= header_ns(begun.poses[0]) else []

@@ -9,6 +9,7 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.progress import Count
+from l2m_gtsam.storage.bag import path_trajectory
 from l2m_gtsam.storage.bag_options import TfChain
 from l2m_gtsam.storage.field_types import FieldSource
 from l2m_gtsam.storage.log import Log
@@ -25,7 +26,6 @@ from l2m_gtsam.storage.messages import (
     stamp_of,
 )
 from l2m_gtsam.storage.open_bag import Bag
-from l2m_gtsam.storage.path_topic import path_trajectory
 from l2m_gtsam.storage.tf import chain_frames
 from l2m_gtsam.storage.units import is_turning, strength
 

@@ -9,7 +9,7 @@ from time import monotonic, sleep
 
 import pytest
 
-from l2m_gtsam.cli import app, endings
+from l2m_gtsam.cli import app
 from tests.support.command_line import ended
 from tests.support.slow_command import SLOW
 
@@ -22,7 +22,7 @@ def test_a_fault_of_the_program_is_one_line(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(app, "app", broken)
     run = ended("inspect", "x")
-    assert run.code == endings.FAULT
+    assert run.code == app.FAULT
     assert run.err == (
         "l2m: a fault of this program, please report it with what --debug shows: "
         "ZeroDivisionError: \\x1b[31mred and more\n"
@@ -65,7 +65,7 @@ def test_output_that_does_not_arrive() -> None:
         run = subprocess.run(
             [*RUN, "--version"], stdout=full, stderr=subprocess.PIPE, check=False, text=True
         )
-    assert run.returncode == endings.USER
+    assert run.returncode == app.USER
     assert run.stderr == "l2m: standard output: cannot be written: No space left on device\n"
 
 
@@ -80,7 +80,7 @@ def test_signals(tmp_path: Path, number: signal.Signals) -> None:
         sleep(0.02)  # between looks: the process shows by a file that it writes
     os.kill(run.pid, number)
     _, err = run.communicate(timeout=60)
-    assert run.returncode == endings.SIGNAL + number
+    assert run.returncode == app.SIGNAL + number
     told = f"l2m: stopped by {number.name}; results that were not complete are not written\n"
     assert err == told
     assert sorted(each.name for each in tmp_path.iterdir()) == ["ready"]

@@ -20,13 +20,14 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FieldSample, FloatArray, MapState
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.bilinear.cells import (
+from l2m_gtsam.maps.bilinear.lattice import (
     BilinearOptions,
     Cells,
+    Lattice,
     averaged,
     cells_from_state,
+    lattice_over,
 )
-from l2m_gtsam.maps.bilinear.lattice import Lattice, lattice_over
 from l2m_gtsam.maps.field_map import MapSummary, masked
 from l2m_gtsam.maps.trained import options_from_state, state_array
 from l2m_gtsam.maps.training import (

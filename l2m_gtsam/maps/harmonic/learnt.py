@@ -28,9 +28,15 @@ from l2m_gtsam.maps.harmonic.tiling import (
     tiling_of,
 )
 from l2m_gtsam.maps.suite_errors import SuiteErrors
-from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.survey_poses import SurveyPoses
-from l2m_gtsam.maps.training import TrainingSet, cubes_of, errors_together, joined, merged
+from l2m_gtsam.maps.training import (
+    TrainingSet,
+    cubes_of,
+    errors_together,
+    joined,
+    merged,
+    survey_doubts,
+)
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.map_diary import UNDATED, MapDrive
 

@@ -5,7 +5,7 @@ import numpy as np
 from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.maps.harmonic.explanation import Explanation
 from l2m_gtsam.maps.harmonic.learnt import Learnt
-from l2m_gtsam.maps.survey import narrow
+from l2m_gtsam.maps.training import narrow
 
 IN_SIGMAS = "their errors are in the sigmas"
 LOCAL = "its own, about those of the map"

@@ -32,8 +32,7 @@ from l2m_gtsam.maps.harmonic.search import (
 )
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import rough_tiles, spread_tiles
-from l2m_gtsam.maps.survey import survey_doubts
-from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
+from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged, survey_doubts
 from l2m_gtsam.parallel.threads import in_threads
 
 # Tiles whose held-out places show whether the field is explained, and those of them where the

@@ -9,7 +9,7 @@ from l2m_factors.field_map import DifferentiableMap
 from l2m_gtsam.data import FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.bilinear.bilinear_map import BilinearMap
-from l2m_gtsam.maps.bilinear.cells import BilinearOptions
+from l2m_gtsam.maps.bilinear.lattice import BilinearOptions
 from l2m_gtsam.maps.build import MapOptions, build_map, map_from_state
 from l2m_gtsam.maps.field_map import FieldMap
 from tests.worlds.exact import dipole_world

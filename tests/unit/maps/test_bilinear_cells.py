@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from l2m_gtsam.data import MapState
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.bilinear.cells import LEAST_STEP, layers_of
+from l2m_gtsam.maps.bilinear.lattice import LEAST_STEP, layers_of
 from l2m_gtsam.maps.build import map_from_state
 
 

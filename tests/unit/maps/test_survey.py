@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.survey import narrow, survey_doubts
-from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.maps.training import TrainingSet, narrow, survey_doubts
 from tests.worlds.harmonic import readings
 
 

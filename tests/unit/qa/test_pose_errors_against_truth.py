@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import SyncError
-from l2m_gtsam.qa.metrics.pose_errors import (
+from l2m_gtsam.qa.metrics.trajectory import (
     ComparedTrajectories,
     check_truth,
     compared,
