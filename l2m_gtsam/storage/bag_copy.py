@@ -30,6 +30,7 @@ from l2m_gtsam.errors import OutputError
 from l2m_gtsam.storage.open_bag import Bag, typestore
 from l2m_gtsam.storage.parts import part_folder
 from l2m_gtsam.storage.ros_messages import ros1, ros2
+from l2m_gtsam.storage.rosbags_bounds import storages
 
 SUFFIX = {StoragePlugin.MCAP: ".mcap", StoragePlugin.SQLITE3: ".db3"}
 TEXT = "std_msgs/msg/String"
@@ -207,19 +208,14 @@ def _ros2_compression(reader: Ros2Reader) -> CompressionMode:
     mode = reader.compression_mode
     if mode:
         return CompressionMode[mode.upper()]
-    files = [each for each in _storages(reader) if isinstance(each, McapReader)]
+    files = [each for each in storages(reader) if isinstance(each, McapReader)]
     chunks = [chunk for each in files for chunk in each.chunks]
     return CompressionMode.STORAGE if any(c.compression for c in chunks) else CompressionMode.NONE
 
 
 def _plugin(reader: Ros2Reader) -> StoragePlugin:
-    is_mcap = isinstance(_storages(reader)[0], McapReader)
+    is_mcap = isinstance(storages(reader)[0], McapReader)
     return StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3
-
-
-def _storages(reader: Ros2Reader) -> list[Any]:
-    """Return what reads the files of a bag: a folder has several."""
-    return getattr(reader.storage, "storages", None) or [reader.storage]
 
 
 def _described(connection: Connection) -> tuple[str, str]:

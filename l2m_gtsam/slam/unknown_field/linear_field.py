@@ -85,7 +85,7 @@ class LinearField(ABC):
             In the anchor's frame in metres, shape (N, 3).
         variance
             Of each reading's noise per axis in uT^2, shape (N, 3).
-        taught
+        past_information
             Information of other readings about the weights, shape (m, m).
         """
         known = np.eye(len(self)) + self.information(points, variance)

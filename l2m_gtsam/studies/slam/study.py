@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,6 +20,7 @@ from l2m_gtsam.studies.slam.methods import (
 from l2m_gtsam.studies.slam.recordings import TrueDrive
 from l2m_gtsam.studies.study import Study
 
+Cell = TypeVar("Cell")
 METHODS = {
     "odometry": "odometry",
     "ekf": "reduced-rank filter",
@@ -128,10 +129,8 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
 
     def summarise(self, options: SlamStudyOptions, cells: Mapping[str, SlamCell]) -> SlamSummary:
         """Return the figures over all seeds."""
-        groups: dict[str, list[SlamCell]] = {}
-        for key, cell in cells.items():
-            groups.setdefault(key.rpartition("-")[0], []).append(cell)
-        return SlamSummary(options, tuple(row_of(key, own) for key, own in groups.items()))
+        rows = (row_of(key, own) for key, own in seeds_together(cells).items())
+        return SlamSummary(options, tuple(rows))
 
     def page_context(self, summary: SlamSummary) -> dict[str, Any]:
         """Return what is lost: rows that a peer wins, wrong sigmas, drives without a gain."""
@@ -221,6 +220,14 @@ def row_of(key: str, cells: list[SlamCell]) -> SlamRow:
         online=figures_of([each.online for each in cells], before),
         ours=figures_of([each.ours for each in cells], before),
     )
+
+
+def seeds_together(cells: Mapping[str, Cell]) -> dict[str, list[Cell]]:
+    """Return cells that differ in their seed alone, by what they have in common."""
+    groups: dict[str, list[Cell]] = {}
+    for key, cell in cells.items():
+        groups.setdefault(key.rpartition("-")[0], []).append(cell)
+    return groups
 
 
 def figures_of(rows: list[MethodRow], before: list[MethodRow]) -> MethodFigures:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from l2m_gtsam.studies.slam.methods import MethodRow, site_of
-from l2m_gtsam.studies.slam.study import WIDTH, MethodFigures, draw_bars, figures_of
+from l2m_gtsam.studies.slam.study import WIDTH, MethodFigures, draw_bars, figures_of, seeds_together
 from l2m_gtsam.studies.slam_array.methods import (
     NEAR_M,
     WIDE_M,
@@ -119,10 +119,8 @@ class SlamArrayStudy(Study[SlamArrayOptions, SlamArrayCell, SlamArraySummary]):
         self, options: SlamArrayOptions, cells: Mapping[str, SlamArrayCell]
     ) -> SlamArraySummary:
         """Return the figures over all seeds."""
-        groups: dict[str, list[SlamArrayCell]] = {}
-        for key, cell in cells.items():
-            groups.setdefault(key.rpartition("-")[0], []).append(cell)
-        return SlamArraySummary(options, tuple(row_of(key, own) for key, own in groups.items()))
+        rows = (row_of(key, own) for key, own in seeds_together(cells).items())
+        return SlamArraySummary(options, tuple(rows))
 
     def page_context(self, summary: SlamArraySummary) -> dict[str, Any]:
         """Return which places there are, rows that odometry wins, and those that kept odometry."""
