@@ -3,7 +3,7 @@
 A filter follows the drive key pose by key pose. Each time that the path has doubled, or has grown
 by a quarter and left the box of the field, the drive so far is solved as off line, from its
 odometry on (:mod:`.smoothed_drive`), and the filter goes on from what that says of the last key
-pose, field and sensor (:mod:`.end_state`). The work is spread over the key poses that come
+pose, field and sensor (``end_state``). The work is spread over the key poses that come
 meanwhile, which are then followed. To begin the solution at the poses found so far was tried: it
 stays near them, and errors on a model ship become half as large or twice as large by chance.
 
