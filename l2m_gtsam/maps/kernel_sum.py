@@ -1,4 +1,4 @@
-"""Posterior means of Gaussian processes on blocks, point by point; see ``kernel``.
+"""Posterior means of Gaussian processes on blocks, point by point; see ``posterior``.
 
     mean_i     = sum_j k_j alpha_ji,    k_j = exp(-|x - y_j|^2 / 2)
     dmean_i/dx = -(1/l) sum_j (x - y_j) k_j alpha_ji
