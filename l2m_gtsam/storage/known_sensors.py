@@ -235,6 +235,11 @@ class ListedSensor(_Known):
         """Whether the list says how well it is known."""
         return {"t_sigma", "C_sigma", "H_sigma"} <= self.model_fields_set
 
+    @property
+    def has_noise(self) -> bool:
+        """Whether the list says how large the noise of a reading is."""
+        return "noise" in self.model_fields_set
+
     def known(self, name: str) -> KnownSensor:
         """Return it as a sensor with a name."""
         return _known(name, self)

@@ -35,11 +35,6 @@ def read_sensors(path: Path) -> CalibrationResult:
     if isinstance(content, dict) and content.get("format") == FORMAT:
         return calibration_in(path, content)
     listed = listed_sensors_in(path, content)
-    assumed = [name for name, each in listed.items() if not each.has_sigmas]
-    named = ", ".join(assumed[:5]) + (" and others" if len(assumed) > 5 else "")
-    note = (
-        f"{path}: sigmas of {named} are not given: 5 mm of t, 0.01 of C and 0.5 uT of H are assumed"
-    )
     return CalibrationResult(
         sensors=tuple(_calibration(path, name, each) for name, each in listed.items()),
         iterations=0,
@@ -50,8 +45,27 @@ def read_sensors(path: Path) -> CalibrationResult:
         map=None,
         options={},
         versions={},
-        notes=(note,) if assumed else (),
+        notes=_assumptions(path, listed),
     )
+
+
+def _assumptions(path: Path, listed: dict[str, ListedSensor]) -> tuple[str, ...]:
+    """Return what a list does not say of its sensors, and what counts instead."""
+    vague = [name for name, each in listed.items() if not each.has_sigmas]
+    silent = [name for name, each in listed.items() if not each.has_noise]
+    sigmas = (
+        f"{path}: sigmas of {_named(vague)} are not given: 5 mm of t, 0.01 of C and 0.5 uT of H "
+        "are assumed"
+    )
+    noise = (
+        f"{path}: the noise of readings of {_named(silent)} is not given (`noise`, uT per axis): "
+        "0.3 uT is assumed"
+    )
+    return (*([sigmas] if vague else []), *([noise] if silent else []))
+
+
+def _named(sensors: list[str]) -> str:
+    return ", ".join(sensors[:5]) + (" and others" if len(sensors) > 5 else "")
 
 
 def _calibration(path: Path, name: str, listed: ListedSensor) -> SensorCalibration:

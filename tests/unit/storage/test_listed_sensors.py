@@ -29,7 +29,16 @@ def test_a_list_says_how_well_sensors_are_known(tmp_path: Path) -> None:
     # R_lidar_mag turns by 90 degrees: x of the sensor lies along y of the lidar.
     np.testing.assert_allclose(right.R_lidar_mag[:, 0], [0, 1, 0], atol=1e-12)
     assert right.noise == 0.2
-    assert "sigmas of right are not given" in found.notes[0]
+    assert left.noise == 0.3
+    of_sigmas, of_noise = found.notes
+    assert "sigmas of right are not given" in of_sigmas
+    assert "the noise of readings of left is not given" in of_noise
+
+
+def test_a_list_that_says_all_has_no_notes(tmp_path: Path) -> None:
+    given = "t_lidar_mag: [0, 0, 0], t_sigma: 0.02, C_sigma: 0.03, H_sigma: 4, noise: 0.2"
+    (tmp_path / "sensors.yaml").write_text(f"sensors: {{a: {{{given}}}}}")
+    assert read_sensors(tmp_path / "sensors.yaml").notes == ()
 
 
 def test_a_calibration_is_read_as_one(tmp_path: Path) -> None:
