@@ -143,13 +143,16 @@ def slam_online(
     if saved is None:
         _write_map_so_far(begun.slam, recording, config, out, progress)
     stamps = recording.trajectory.stamp_ns
+    from_first = saved is None and not config.slam.start.is_given
     return OnlineOutcome(
         trajectory,
         tuple(each for each in run.lines if each.event is not None),
         np.array(run.cost_s),
         NS * float(stamps[-1] - max(int(stamps[0]), begun.after_ns)),
         resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        None if truth is None else _compared(truth, trajectory, recording, config),
+        None
+        if truth is None
+        else _compared(truth, trajectory, recording, config, from_first=from_first),
     )
 
 
@@ -310,9 +313,10 @@ def in_map(odometry: Trajectory, found: Trajectory) -> Trajectory:
 
 
 def _compared(
-    truth: Trajectory, found: Trajectory, recording: Recording, config: Config
+    truth: Trajectory, found: Trajectory, recording: Recording, config: Config, *, from_first: bool
 ) -> TruthRecord | None:
     if not len(found):
         return None
     odometry = in_map(interpolated(recording.trajectory, found.stamp_ns), found)
-    return truth_record(truth, ComparedTrajectories(found, odometry), config.slam.max_pose_gap_s)
+    tested = ComparedTrajectories(found, odometry, from_first=from_first)
+    return truth_record(truth, tested, config.slam.max_pose_gap_s)

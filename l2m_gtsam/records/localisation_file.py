@@ -178,12 +178,14 @@ class TruthRecord(Record):
         Errors of odometry and scans without magnetometers; absent without scans.
     nees
         Mean of the squared errors of localised poses in units of their covariances; expected 6.
+        Without a first pose that defines the frame.
     beyond_95
         Share of those beyond the 95 % quantile of chi-square of six; expected 0.05.
     path
         True places at all K key poses, (K, 3); NaN where there is none.
     odometry_m, localised_m, squared
-        Distances, and squared errors in units of their covariances, K of each; NaN there, too.
+        Distances, and squared errors in units of their covariances, K of each; NaN there, too, and
+        of a first pose that defines the frame.
     """
 
     SHAPES: ClassVar[Mapping[str, str]] = {

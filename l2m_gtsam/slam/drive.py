@@ -73,6 +73,11 @@ class StartPose:
     T_map_lidar: RigidTransform
     covariance: FloatArray
 
+    @property
+    def defines_frame(self) -> bool:
+        """Whether poses are relative to it, so that it has no error."""
+        return np.array_equal(self.covariance, EXACT_START)
+
 
 @dataclass(frozen=True)
 class OdometryJump:

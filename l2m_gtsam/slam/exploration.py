@@ -93,7 +93,7 @@ def explore(
     if options.start.anywhere:
         raise ConfigError("`slam.start.anywhere` searches a map for the start: give one with --map")
     drive, notes = prepared(recording, calibration, options, evidence)
-    if options.start.position is None and options.start.quaternion_xyzw is None:
+    if not options.start.is_given:
         drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
     progress("learning the field's prior", 0.0)
     by_scans = without_field(with_open_jumps(drive), options)

@@ -221,6 +221,11 @@ class StartPoseOptions(Options):
     """How, with `anywhere`."""
 
     @property
+    def is_given(self) -> bool:
+        """Whether it is said where the drive begins; without a map its first pose is else exact."""
+        return self.position is not None or self.quaternion_xyzw is not None
+
+    @property
     def by_odometry(self) -> bool:
         """Whether the first recorded pose puts odometry into the map: both are in one frame."""
         is_given = self.position is not None and self.quaternion_xyzw is not None

@@ -96,7 +96,12 @@ def localisation_record(
     """
     truth = None
     if context.truth is not None:
-        compared = ComparedTrajectories(result.trajectory, result.odometry, result.by_scans)
+        compared = ComparedTrajectories(
+            result.trajectory,
+            result.odometry,
+            result.by_scans,
+            from_first=solution.drive.start.defines_frame,
+        )
         truth = truth_record(context.truth, compared, context.max_pose_gap_s)
     now = result.calibration or context.calibration
     return LocalisationRecord(

@@ -166,11 +166,15 @@ class ComparedTrajectories:
         By odometry alone.
     by_scans
         By odometry and scans; None without scans.
+    from_first
+        Whether the first pose defines the frame of the others, as without a map: it is held, and
+        its covariance says nothing of its errors in the frame of the truth.
     """
 
     localised: Trajectory
     odometry: Trajectory
     by_scans: Trajectory | None = None
+    from_first: bool = False
 
 
 def truth_record(
@@ -196,6 +200,9 @@ def truth_record(
     covariance = localised.covariance
     unknown = np.full(len(at), np.nan)
     squared = unknown if covariance is None else after.squared(covariance[there])
+    if tested.from_first and there[0]:
+        squared = np.append(np.nan, squared[1:])
+    judged = squared[~np.isnan(squared)]
     path = np.full((len(there), 3), np.nan)
     path[there] = at.p
     return TruthRecord(
@@ -203,8 +210,8 @@ def truth_record(
         odometry=before.figures(),
         localised=after.figures(),
         by_scans=None if by_scans is None else compared(at, by_scans[there]).figures(),
-        nees=float(squared.mean()),
-        beyond_95=float(np.mean(squared > quantile(0.95, POSE_FREEDOM))),
+        nees=float(judged.mean()) if len(judged) else float("nan"),
+        beyond_95=float((judged > quantile(0.95, POSE_FREEDOM)).mean()) if len(judged) else 0.0,
         path=rows(path),
         odometry_m=row(_spread(before.distance, there)),
         localised_m=row(_spread(after.distance, there)),

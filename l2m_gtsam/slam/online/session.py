@@ -208,7 +208,7 @@ class OnlineSlam:
             return
         start = start_pose(first, start_options)
         if self._map is None:
-            if start_options.position is None and start_options.quaternion_xyzw is None:
+            if not start_options.is_given:
                 start = replace(start, covariance=EXACT_START)
             if self._one_field:
                 self.estimator = OneFieldExplorer(start, self.sensors, self.options)

@@ -18,6 +18,7 @@ from l2m_gtsam.qa.metrics.trajectory import (
     compared,
     truth_record,
 )
+from l2m_gtsam.slam.drive import EXACT_START
 
 STEP_NS = 100_000_000
 
@@ -77,6 +78,33 @@ def test_nees_is_honest_where_covariances_are() -> None:
     )
     assert bold is not None
     assert bold.nees == pytest.approx(4 * record.nees, rel=1e-9)
+
+
+def test_a_first_pose_that_defines_the_frame_does_not_count() -> None:
+    """A degree that the truth has at the start is thousands of sigmas of a pose that is held."""
+    rng = np.random.default_rng(8)
+    count = 500
+    sigma = np.repeat([0.01, 0.05], 3)
+    error, covariance = (
+        sigma * rng.normal(size=(count, 6)),
+        np.tile(np.diag(sigma**2), (count, 1, 1)),
+    )
+    error[0], covariance[0] = np.repeat([0.01, 0.0], 3), EXACT_START
+    truth = trajectory(rng, count)
+    found = replace(perturbed(truth, error), covariance=covariance)
+    as_it_is = truth_record(truth, ComparedTrajectories(found, found), 1.0)
+    record = truth_record(truth, ComparedTrajectories(found, found, from_first=True), 1.0)
+    assert as_it_is is not None
+    assert record is not None
+    assert as_it_is.nees > 60
+    # The mean of 499 chi-squares of six has a standard deviation of 0.16.
+    assert record.nees == pytest.approx(6, abs=0.6)
+    assert np.isnan(record.squared[0])
+    assert record.poses == count
+    held = found[np.arange(1)]
+    alone = truth_record(truth, ComparedTrajectories(held, held, from_first=True), 1.0)
+    assert alone is not None
+    assert np.isnan(alone.nees)
 
 
 def test_truth_is_interpolated_within_its_time_only() -> None:
