@@ -13,6 +13,7 @@ from l2m_gtsam.records.localisation import Explored, LocalisationResult, Localis
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import EXACT_START, Drive
+from l2m_gtsam.slam.held_calibration import held_notes
 from l2m_gtsam.slam.localisation import NO_SCANS, prepared
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
@@ -108,11 +109,15 @@ def explore(
     refined = options.calibration is CalibrationUse.REFINED and mapped.is_corrected
     kept = calibration if refined else None
     result = localisation_result(drive, mapped.solution, by_scans, kept)
+    # One sensor's C and H are estimated in any case.
+    is_held = options.calibration is CalibrationUse.FIXED and not has_one_sensor(drive)
+    held = held_notes(drive) if is_held else ()
     explored = Explored(len(mapped.tiled.tiles), len(mapped.returns) / len(drive))
     result = replace(
         explored_result(result, explored),
         notes=(
             *notes,
+            *held,
             *odometry.notes,
             *result.notes,
             *([] if explored.returned else [NO_REVISITS]),

@@ -20,6 +20,7 @@ from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, odometry_jumps
+from l2m_gtsam.slam.held_calibration import held_notes
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import key_pose_links, link_stamps
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
@@ -115,7 +116,8 @@ def localise(
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
     result = localisation_result(drive, solution, by_scans, kept, decoys)
-    notes = (*notes, *odometry.notes, *result.notes, *decoy_notes(len(maps), len(decoys)))
+    held = () if refined else held_notes(drive)
+    notes = (*notes, *held, *odometry.notes, *result.notes, *decoy_notes(len(maps), len(decoys)))
     hints = plane_hints(recording.trajectory, options.drift, is_stated=drive.steps.stated)
     result = replace(result, notes=notes, hints=hints, bag=recording.source, start=search)
     return Localisation(result, solution)
