@@ -46,4 +46,4 @@ def _error(sensors: KnownSensors, readings: KeyPoseReadings, index: int) -> floa
     covariance = sensors.covariance[index, 3:, 3:]
     rows = [np.array([3 * axis, 3 * axis + 1, 3 * axis + 2, 9 + axis]) for axis in range(3)]
     variance = [float((mean * covariance[np.ix_(row, row)]).sum()) for row in rows]
-    return max(float(np.mean(variance)), 0.0) ** 0.5  # by rounding it may be less than none
+    return float(np.sqrt(max(float(np.mean(variance)), 0.0)))  # rounding may make it negative
