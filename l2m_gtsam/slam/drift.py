@@ -8,8 +8,9 @@ from l2m_gtsam.slam.options import DriftOptions
 
 PLANAR = 1e-6  # metres and radians; a lidar or a gyroscope leaves a plane by more
 PLANE = (
-    "Odometry never leaves a plane: if the floor is as even, `slam.drift.height_share: 0` and "
-    "`slam.drift.tilt_deg_per_m: 0` say so, and poses become better."
+    "Odometry never leaves a plane: if the floor is as even and the vehicle does not rock, "
+    "`slam.drift.height_share: 0` and `slam.drift.tilt_deg_per_m: 0` say so, and poses become "
+    "better."
 )
 
 
