@@ -91,8 +91,9 @@ class Disturbance:
         lidar's frame ``tilt_deg`` and ``floor_m`` (along x and y), ``heading_deg`` and
         ``height_m`` (along z); how long an error lasts, ``lasting_s``; ``shift_m``, of the
         floor's axes; ``drift_s``, of a clock from the start to the end of a drive;
-        ``smoothing_s``, of the time that a reading is a mean over; ``turning_ut``, ``speed_ut``
-        and ``acceleration_ut``, of an H that follows these, for a standard deviation of each.
+        ``smoothing_s``, of the time that a reading is a mean over; ``turning_ut``,
+        ``steering_ut``, ``speed_ut`` and ``acceleration_ut``, of an H that follows these, for a
+        standard deviation of each.
     gain
         Twice the logarithm by which the drive is more likely with it.
     sensor

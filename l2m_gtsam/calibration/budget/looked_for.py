@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from l2m_gtsam.calibration.budget.clock import CLOCK_MODES, ClockDrift
-from l2m_gtsam.calibration.budget.moving_parts import MovingParts, VehicleMotion
+from l2m_gtsam.calibration.budget.moving_parts import MotionUnits, MovingParts
 from l2m_gtsam.calibration.budget.processes import (
     WANDER_MODES,
     FieldProcess,
@@ -33,7 +33,7 @@ def processes(places: ReadingPlaces, sensors: Sequence[int]) -> tuple[Process, .
         slowest = TimeModes.over(readings, CLOCK_MODES)
         found += [ClockDrift(places, sensor, slowest) for sensor in sensors]
         found += [Smoothing(places, sensor) for sensor in sensors]
-        vehicle = VehicleMotion.over(readings, readings.motion)
+        vehicle = MotionUnits.over(readings, readings.motion)
         found += [MovingParts(places, sensor, vehicle) for sensor in sensors]
     count = int(np.clip(np.ceil(slow.duration.max() / FINEST_S), *FAST_MODES))
     fast = TimeModes.over(readings, count)

@@ -102,6 +102,7 @@ PARTS = {
     "drift_s": (1e3, "{:.0f} ms from the start of the drive to its end"),
     "smoothing_s": (1e3, "{:.0f} ms"),
     "turning_ut": (1.0, "{:.2g} µT with its turns"),
+    "steering_ut": (1.0, "{:.2g} µT with its steering"),
     "speed_ut": (1.0, "{:.2g} µT with its speed"),
     "acceleration_ut": (1.0, "{:.2g} µT with its acceleration"),
     "walk_ut": (1.0, "{:.2g} µT from the start of the drive to its end"),
@@ -118,6 +119,8 @@ CAUSES = {
     DisturbanceKind.SMOOTHING: ErrorCause.SMOOTHING,
     DisturbanceKind.MOVING_PARTS: ErrorCause.MOVING_PARTS,
 }
+# What stands for numbers that were not recorded follows them by and large only.
+STAND_INS = (DisturbanceKind.MOVING_PARTS,)
 MATTERS = 0.1  # of a variance: what has less of it adds 5 % to a sigma at most
 
 
@@ -125,7 +128,8 @@ def disturbance_reasons(result: CalibrationResult) -> list[Reason]:
     """Return what disturbed a drive: a warning where it has a share in what is not known."""
     reasons = []
     for found in result.disturbances:
-        level = Level.WARN if _share(found, result) > MATTERS else Level.PASS
+        matters = found.kind in STAND_INS or _share(found, result) > MATTERS
+        level = Level.WARN if matters else Level.PASS
         reasons.append(Reason(level, disturbance_sentence(found)))
     return reasons
 

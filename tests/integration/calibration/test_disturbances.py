@@ -139,7 +139,8 @@ def test_iron_that_steers_is_found_and_held() -> None:
     moving = shown(Trouble.STEERING, DisturbanceKind.MOVING_PARTS)
     assert [each.sensor for each in moving] == ["mag_00", "mag_01"]
     for each in moving:
-        assert each.sizes["turning_ut"] > 5 * each.sizes["acceleration_ut"]
+        steers = each.sizes["turning_ut"] + each.sizes["steering_ut"]
+        assert steers > 5 * each.sizes["acceleration_ut"]
     assert max(distances(found, truth)) < WITHIN
     assert verdict.level is Level.WARN
     assert any("H of mag_00 follows how the vehicle" in each.text for each in verdict.reasons)

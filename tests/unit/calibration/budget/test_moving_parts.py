@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.budget.looked_for import processes
 from l2m_gtsam.calibration.budget.moving_parts import (
+    MotionUnits,
     MovingParts,
-    VehicleMotion,
     motion_numbers,
 )
 from l2m_gtsam.data import LidarMotion
@@ -43,34 +43,37 @@ def test_numbers_are_those_of_the_way() -> None:
     growth = np.tile([0, 0, 0, 0.9, -0.5, 0], (COUNT, 1))
     level = np.tile(np.eye(3), (COUNT, 1, 1))
     numbers = motion_numbers(level, LidarMotion(twist, growth, np.zeros(COUNT)))
-    np.testing.assert_allclose(numbers, [[0.3, 2.0, -0.5]] * COUNT, atol=1e-12)
+    np.testing.assert_allclose(
+        numbers, [[0.3, 0.3 / np.sqrt(0.3**2 + 2.0**2 + 0.01), 2.0, -0.5]] * COUNT, atol=1e-12
+    )
     at_rest = motion_numbers(level, LidarMotion.steady(np.zeros((COUNT, 6))))
     np.testing.assert_array_equal(at_rest, 0.0)
 
 
 def test_features_add_to_the_readings_along_their_axes() -> None:
     readings = replace(PLACES.readings, motion=motion(2))
-    vehicle = VehicleMotion.over(readings, motion(2))
+    vehicle = MotionUnits.over(readings, motion(2))
     values = vehicle.values(readings, ROWS)
     np.testing.assert_allclose(values.std(axis=0), 1.0)
     found = MovingParts(replace(PLACES, readings=readings), 0, vehicle)
     added = PLACES.C @ found.features(ROWS)
-    expected = np.einsum("nk,ia->nika", values, np.eye(3)).reshape(COUNT, 3, 9)
-    np.testing.assert_allclose(added, expected, atol=1e-12)
-    names = found.named(0, np.array([0.04, 0.0, 0.25]))
-    assert names == pytest.approx({"turning_ut": 0.2, "speed_ut": 0.0, "acceleration_ut": 0.5})
+    along = np.einsum("nk,ia->nika", values, np.eye(3)).reshape(COUNT, 3, 12)
+    np.testing.assert_allclose(added, along, atol=1e-12)
+    expected = {"turning_ut": 0.2, "steering_ut": 0.0, "speed_ut": 0.1, "acceleration_ut": 0.5}
+    names = found.named(0, np.array([0.04, 0.0, 0.01, 0.25]))
+    assert names == pytest.approx(expected)
 
 
 def test_what_does_not_vary_adds_nothing() -> None:
     steady = LidarMotion.steady(np.tile([0, 0, 0, 1.0, 0, 0], (COUNT, 1)))
     readings = replace(PLACES.readings, motion=steady)
-    values = VehicleMotion.over(readings, steady).values(readings, ROWS)
+    values = MotionUnits.over(readings, steady).values(readings, ROWS)
     np.testing.assert_array_equal(values, 0.0)
 
 
 def test_other_readings_have_the_units_of_the_drive() -> None:
     readings = replace(PLACES.readings, motion=motion(3))
-    vehicle = VehicleMotion.over(readings, motion(3))
+    vehicle = MotionUnits.over(readings, motion(3))
     every = MovingParts(replace(PLACES, readings=readings), 0, vehicle)
     part = np.arange(10, 25)
     few = scene(np.linspace(0.0, 30.0, COUNT))
