@@ -204,7 +204,8 @@ def test_the_bound_is_what_the_solve_states_at_the_truth() -> None:
     the truth they differ by a few per cent more.
     """
     # The bound knows of no bend of the frame.
-    options = replace(TINY, solve=replace(TINY.solve, warp_m=0.0))
+    solve = TINY.solve.model_copy(update={"warp_m": 0.0})
+    options = TINY.model_copy(update={"solve": solve})
     place = mapped_hall(options, 0.2, 0)
     cell = cell_of(options, place, Condition.CLEAN)
     stated, least = (
