@@ -12,6 +12,7 @@ from l2m_gtsam.calibration.budget.found import spread_of_H
 from l2m_gtsam.calibration.budget.looked_for import processes
 from l2m_gtsam.calibration.budget.processes import Process, ReadingPlaces, Warp
 from l2m_gtsam.calibration.budget.search import ProcessInformation, process_information
+from l2m_gtsam.calibration.budget.smoothing import LAGGING_S
 from l2m_gtsam.calibration.budget.unseen_warp import UnseenWarp
 from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.coverage import Correction, Coverage
@@ -110,7 +111,9 @@ class UncertainOptimum:
 
     def informed(self) -> ProcessInformation:
         """Return what residuals say of all processes that are looked for; none is in the graph."""
-        return self._informed(processes(self._places, self._view.sensors))
+        sensors, offset = self._view.sensors, self.problem.estimate.offset
+        lagging = [sensor for sensor in sensors if offset[sensor] < -LAGGING_S]
+        return self._informed(processes(self._places, sensors, lagging))
 
     def informed_of_warp(self) -> ProcessInformation:
         """Return what residuals say of a bend of the frame; none is in the graph."""

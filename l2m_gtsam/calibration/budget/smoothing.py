@@ -7,8 +7,7 @@ With h(s) how much of a reading is of the field s seconds ago, m the mean of s a
 
 The mean is a time offset, a variable of the graph; the variance is the weight of one mode. A filter
 of first order with a time constant of T has a mean of T and a variance of T^2, a mean over a time W
-has W / 2 and W^2 / 12. Poses that are smoothed more than readings are, as those of an estimator
-may be, have a negative one.
+has W / 2 and W^2 / 12.
 """
 
 from dataclasses import dataclass, replace
@@ -18,6 +17,8 @@ import numpy as np
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import DisturbanceKind
+
+LAGGING_S = 0.015  # a filter that delays by less smooths by less, which does not show
 
 
 @dataclass(frozen=True)

@@ -98,13 +98,19 @@ def test_a_map_that_ends_near_by_leaves_the_field_straight() -> None:
     assert not features[far].any()
 
 
-def test_smoothing_is_looked_for_where_the_lidar_moves() -> None:
-    still = scene(np.linspace(0, 10, 20))
-    assert DisturbanceKind.SMOOTHING not in {each.kind for each in processes(still, (0,))}
-    moving = places(Waves(), readings())
-    assert [
-        each.sensor for each in processes(moving, (0,)) if each.kind is DisturbanceKind.SMOOTHING
-    ] == [0]
+def test_smoothing_is_looked_for_where_a_sensor_lags_and_no_errors_of_poses_are_stated() -> None:
+    still, moving = scene(np.linspace(0, 10, 20)), places(Waves(), readings())
+    roots = np.broadcast_to(0.01 * np.eye(6), (len(SECONDS), 6, 6))
+    stated = replace(moving, readings=replace(moving.readings, pose_root=roots))
+    assert smoothed(still, (0,)) == []
+    assert smoothed(moving, (0,)) == [0]
+    assert smoothed(moving, ()) == []
+    assert smoothed(stated, (0,)) == []
+
+
+def smoothed(at: ReadingPlaces, lagging: tuple[int, ...]) -> list[int | None]:
+    found = processes(at, (0,), lagging)
+    return [each.sensor for each in found if each.kind is DisturbanceKind.SMOOTHING]
 
 
 def test_other_readings_feel_the_same() -> None:
