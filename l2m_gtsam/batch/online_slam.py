@@ -137,7 +137,9 @@ def slam_online(
         run = _Run(begun, log, out / STATE_FILE, config.slam.online.save_every_s)
         scans = () if matcher is None else bag_scans(given.bag, config, silent)
         run.drive(recording, scans, progress)
-    _write_calibration_so_far(run.last, calibration, given, recording, config, out)
+    refines = begun.slam.options.calibration is CalibrationUse.REFINED
+    last = run.last if refines else None
+    _write_calibration_so_far(last, calibration, given, recording, config, out)
     trajectory = logged_trajectory(run.lines)
     write_tum(out / TRAJECTORY_FILE, trajectory)
     if saved is None:
@@ -271,9 +273,9 @@ def _write_calibration_so_far(
     config: Config,
     out: Path,
 ) -> None:
-    """Write the calibration as the last pose has it, where it was refined; else there is none."""
+    """Write the calibration as the last pose has it, if there is one and it was refined."""
     (out / REFINED_FILE).unlink(missing_ok=True)
-    if last is None or config.slam.calibration is not CalibrationUse.REFINED:
+    if last is None:
         return
     found = replace(
         refined(before, last.sensors),

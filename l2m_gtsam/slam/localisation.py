@@ -25,7 +25,13 @@ from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import key_pose_links, link_stamps
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes
+from l2m_gtsam.slam.options import (
+    CalibrationUse,
+    SlamOptions,
+    StartPoseOptions,
+    StepAxes,
+    with_calibration_use,
+)
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.slips import judged, with_open_jumps
@@ -98,6 +104,7 @@ def localise(
         )
     if options.start.by_odometry:
         check_frame(field_map, recording)
+    options = with_calibration_use(options, one_field=False)
     drive, notes = prepared(recording, calibration, options, evidence)
     solver_map = for_solvers(field_map)
     search = None

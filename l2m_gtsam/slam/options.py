@@ -107,6 +107,7 @@ class WholeFieldOptions(Options):
 class CalibrationUse(StrEnum):
     """What becomes of the sensors' calibration."""
 
+    AUTO = "auto"
     FIXED = "fixed"
     REFINED = "refined"
 
@@ -262,8 +263,10 @@ class SlamOptions(Options):
     """Which of its steps are not believed at all."""
     start: StartPoseOptions = StartPoseOptions()
     """Where the drive begins."""
-    calibration: CalibrationUse = CalibrationUse.FIXED
-    """`fixed`, or `refined`: estimated with the poses, with its covariance as the prior."""
+    calibration: CalibrationUse = CalibrationUse.AUTO
+    """`refined`: estimated with the poses, with its covariance as the prior, so that its sigmas are
+    in those of the poses. `fixed`: held as it is given. `auto`: refined, but fixed of one sensor
+    without map and scans, whose field would follow whatever its calibration becomes."""
     scans: Usage = Usage.USED
     """`used`: point clouds, if the bag has any, are registered on the cloud of the map, or on each
     other where places are come to again; or `ignored`."""
@@ -278,6 +281,22 @@ class SlamOptions(Options):
     """How data are taken on line."""
     max_iterations: int = Field(default=50, ge=1)
     """The most steps of the optimiser in each round."""
+
+
+def with_calibration_use(options: SlamOptions, *, one_field: bool) -> SlamOptions:
+    """Return options in which `calibration` is `fixed` or `refined`.
+
+    Parameters
+    ----------
+    options
+        As they are given.
+    one_field
+        Whether there is a single sensor and nothing else that knows its places.
+    """
+    if options.calibration is not CalibrationUse.AUTO:
+        return options
+    use = CalibrationUse.FIXED if one_field else CalibrationUse.REFINED
+    return options.model_copy(update={"calibration": use})
 
 
 def refuse_offline_only(options: SlamOptions, *, has_map: bool, one_field: bool) -> None:

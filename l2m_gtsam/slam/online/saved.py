@@ -114,7 +114,7 @@ def resumed_slam(
     """
     slam = OnlineSlam(calibration, options, field_map, matcher)
     names = "\n".join(slam.sensors.names).encode()
-    if state.facts.get("options") != options.model_dump(mode="json"):
+    if state.facts.get("options") != slam.options.model_dump(mode="json"):
         raise ConfigError(OTHER)
     try:
         if state.arrays["sensor.names"].tobytes() != names:

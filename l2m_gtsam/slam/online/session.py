@@ -31,7 +31,12 @@ from l2m_gtsam.slam.online.intake import Intake, trajectory_of
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
 from l2m_gtsam.slam.online.odometry_check import OdometryPose
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanLinks, ScanMatcher
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, refuse_offline_only
+from l2m_gtsam.slam.options import (
+    CalibrationUse,
+    SlamOptions,
+    refuse_offline_only,
+    with_calibration_use,
+)
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
@@ -135,7 +140,8 @@ class OnlineSlam:
             raise CalibrationError("no sensor has a calibration that can be used")
         self._one_field = field_map is None and matcher is None and len(usable) == 1
         refuse_offline_only(options, has_map=field_map is not None, one_field=self._one_field)
-        self.options, self.sensors = options, known_sensors(usable)
+        self.options = with_calibration_use(options, one_field=self._one_field)
+        self.sensors = known_sensors(usable)
         self._map = None if field_map is None else for_solvers(field_map)
         self.matcher = matcher
         axes = None if field_map is None else np.array([1.0, 1.0, options.drift.of_height])

@@ -114,7 +114,7 @@ def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> F
     else:
         learnt, found = before, at_odometry(drive, before, options)
     solution = found.solution
-    if options.calibration is CalibrationUse.FIXED:
+    if options.calibration is not CalibrationUse.REFINED:
         solution = as_calibrated(solution, drive.sensors)
     p = np.stack([pose.translation() for pose in solution.poses])
     near = learnt.spectrum.prior.length

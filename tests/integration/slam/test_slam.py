@@ -46,7 +46,13 @@ def test_a_known_map_takes_the_drift_out() -> None:
     # The reported drift is that from the localised poses: as true as these are.
     end = float(np.linalg.norm(result.odometry.p[-1] - drive.truth.p[-1]))
     assert result.drift.end_m == pytest.approx(end, abs=0.1)
-    assert result.calibration is None
+
+
+def test_a_calibration_is_refined_unless_it_is_fixed() -> None:
+    sensors, drive = small_hall(11, seconds=12)
+    for use in CalibrationUse:
+        result = located(drive, dipole_world(1), calibrated(sensors), calibration=use.value)
+        assert (result.calibration is None) == (use is CalibrationUse.FIXED)
 
 
 def test_a_calibration_that_is_off_is_refined() -> None:
