@@ -64,7 +64,9 @@ def validate(
     calibration: CalibrationOption,
     bag: Annotated[
         Path | None,
-        typer.Argument(metavar="[BAG]", help="Another drive: ROS1 .bag, ROS2 folder, .db3, .mcap."),
+        typer.Argument(
+            metavar="[BAG]", help="Another drive, of the same kinds as for `calibrate`."
+        ),
     ] = None,
     map_path: Annotated[
         Path | None, typer.Option("--map", help="Map file of the place of the drive.")

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 def slam(
     bag: Annotated[
         Path,
-        typer.Argument(metavar="BAG", help="Drive with odometry: ROS1 .bag, ROS2 folder, .mcap."),
+        typer.Argument(
+            metavar="BAG", help="Drive with odometry, of the same kinds as for `calibrate`."
+        ),
     ],
     calibration: SensorsOption,
     out: OutOption,
