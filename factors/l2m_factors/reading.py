@@ -65,10 +65,6 @@ class BatchedReadings:
         """Return the indices of this sensor's readings."""
         return np.flatnonzero(self._readings.sensor == sensor)
 
-    def R_lidar_map(self, rows: npt.NDArray[np.int64]) -> FloatArray:
-        """Return the rotations from map to lidar at these readings, shape (n, 3, 3)."""
-        return np.asarray(self._readings.R_map_lidar[rows].transpose(0, 2, 1))
-
     def keys_of(self, sensor: int) -> list[int]:
         """Return the keys that this sensor's factors depend on."""
         return self._keys[sensor]

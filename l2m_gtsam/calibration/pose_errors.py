@@ -86,17 +86,21 @@ class PoseKnots:
         """Return what the knots before and after say of the error at each time, shape (N, 2)."""
         return self._weights(*self._between(seconds))
 
-    def bridge(self, seconds: FloatArray) -> FloatArray:
-        """Return the covariance of what the knots leave open at times of one segment, (n, n)."""
-        return self.left(seconds, self.weights(seconds), self.at_knots(seconds))
-
     def at_knots(self, seconds: FloatArray) -> FloatArray:
         """Return the correlation of each time with the knots before and after, shape (N, 2)."""
         after, spacing = self._between(seconds)
         return np.column_stack([self._like(after), self._like(spacing - after)])
 
     def left(self, seconds: FloatArray, weights: FloatArray, at_knots: FloatArray) -> FloatArray:
-        """Return ``bridge`` from what ``weights`` and ``at_knots`` say of these times."""
+        """Return the covariance of what the knots leave open at times of one segment, (n, n).
+
+        Parameters
+        ----------
+        seconds
+            The times, shape (n,).
+        weights, at_knots
+            What the methods of these names say of them, shapes (n, 2).
+        """
         return np.asarray(self._like(np.abs(seconds[:, None] - seconds)) - weights @ at_knots.T)
 
     def _between(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:

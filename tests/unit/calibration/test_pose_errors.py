@@ -16,6 +16,7 @@ from l2m_gtsam.calibration.pose_errors import (
     SegmentMeans,
     error_of_poses,
 )
+from tests.support.knots import left_open
 from tests.worlds.exact import dipole_world, drive, random_sensors
 
 
@@ -38,7 +39,7 @@ def test_knots_and_bridges_are_the_process(seed: int, correlation: float, length
     total = covariance @ np.exp(-apart / correlation) @ covariance.T
     for segment in np.unique(before):
         own = np.flatnonzero(before == segment)
-        total[np.ix_(own, own)] += knots.bridge(at[own])
+        total[np.ix_(own, own)] += left_open(knots, at[own])
     expected = np.exp(-np.abs(at[:, None] - at) / correlation)
     np.testing.assert_allclose(total, expected, atol=1e-9)
 
@@ -48,7 +49,7 @@ def test_knots_stand_as_close_as_errors_last_but_are_not_too_many() -> None:
     assert PoseKnots.over(at, 20.0).spacing == pytest.approx(10.0)
     assert len(PoseKnots.over(at, 0.1).seconds) == 61
     alone = PoseKnots.over(np.array([3.0]), 1.0)
-    np.testing.assert_allclose(alone.bridge(np.array([3.0])), 0, atol=1e-6)
+    np.testing.assert_allclose(left_open(alone, np.array([3.0])), 0, atol=1e-6)
 
 
 @given(first=st.floats(0.0, 1e4), length=st.floats(1.0, 1e4))
@@ -62,7 +63,7 @@ def test_errors_that_do_not_last_are_independent() -> None:
     knots = PoseKnots.over(np.linspace(0, 10, 100), 0.0)
     # A mean over a sixth of a second of errors that last a microsecond: 1e-5 of their variance.
     np.testing.assert_allclose(knots.weights(at), 0, atol=1e-2)
-    np.testing.assert_allclose(knots.bridge(at), np.eye(5), atol=1e-4)
+    np.testing.assert_allclose(left_open(knots, at), np.eye(5), atol=1e-4)
 
 
 @given(seed=st.integers(0, 1000), correlation=st.floats(0.03, 0.3))
@@ -74,9 +75,9 @@ def test_means_of_short_errors_are_what_times_of_a_segment_share(
     assert isinstance(knots, SegmentMeans)
     at = 4.0 + np.sort(np.random.default_rng(seed).uniform(0.0, 2.0, 30))  # one segment
     weights = knots.weights(at)
-    total = knots.bridge(at) + weights @ weights.T
+    total = left_open(knots, at) + weights @ weights.T
     np.testing.assert_allclose(total, np.exp(-np.abs(at[:, None] - at) / correlation), atol=1e-12)
-    assert np.linalg.eigvalsh(knots.bridge(at)).min() > -1e-12
+    assert np.linalg.eigvalsh(left_open(knots, at)).min() > -1e-12
     fine = np.linspace(4.0, 6.0, 801)
     mean = np.exp(-np.abs(fine[:, None] - fine) / correlation).mean()
     # The mean over the weights is the deviation of the mean; sums stand for integrals.

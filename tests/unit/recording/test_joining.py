@@ -30,6 +30,7 @@ from l2m_gtsam.records.sensor_models import Samples
 from l2m_gtsam.solve.model_comparison import correlation_of, segments_of
 from l2m_gtsam.solve.profile import interpolated
 from l2m_gtsam.solve.robust import LATER_S
+from tests.support.knots import left_open
 
 STEP_NS = 50_000_000
 GPS = 1_700_000_000_000_000_000
@@ -246,7 +247,7 @@ def test_pose_errors_of_two_drives_have_nothing_in_common() -> None:
     segment, weights = knots.segment(seconds), np.zeros((len(seconds), K))
     rows = np.arange(len(seconds))
     weights[rows, segment], weights[rows, segment + 1] = knots.weights(seconds).T
-    bridges = [knots.bridge(seconds[segment == each]) for each in np.unique(segment)]
+    bridges = [left_open(knots, seconds[segment == each]) for each in np.unique(segment)]
     found = weights @ of_knots @ weights.T + block_diag(*bridges)
     apart = np.abs(seconds[:, None] - seconds)
     expected = np.exp(-apart / lasts) * (of[:, None] == of)
