@@ -121,7 +121,7 @@ def _in_folder(order: FleetOrder) -> list[FleetDrive]:
     bags = find_bags(order.source, order.out)
     if not bags:
         raise BagError(
-            f"{order.source}: no bags in it; accepted: ROS1 .bag, .mcap, .db3, ROS2 folders"
+            f"{order.source}: no bags in it; accepted: ROS1 .bag, .mcap, .db3, .ulg, ROS2 folders"
         )
     if order.map_path is None:
         raise ConfigError(f"{order.source}: a folder of bags needs a map; give it with --map")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from l2m_gtsam.cli.terminal import (
+    LOGS,
     BagArgument,
     ConfigOption,
     MapOption,
@@ -149,8 +150,7 @@ def calibrate(
         list[Path] | None,
         typer.Argument(
             metavar="BAG...",
-            help="ROS1 .bag, ROS2 folder, .db3, .mcap, .csv or .ulg; several of one vehicle are "
-            "calibrated together and compared.",
+            help=f"{LOGS}; several of one vehicle are calibrated together and compared.",
         ),
     ] = None,
     more: Annotated[

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from l2m_gtsam.cli.terminal import (
+    LOGS,
     CalibrationOption,
     PosesOption,
     PoseTimesOption,
@@ -64,9 +65,7 @@ def validate(
     calibration: CalibrationOption,
     bag: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="[BAG]", help="Another drive, of the same kinds as for `calibrate`."
-        ),
+        typer.Argument(metavar="[BAG]", help=f"Another drive: {LOGS}."),
     ] = None,
     map_path: Annotated[
         Path | None, typer.Option("--map", help="Map file of the place of the drive.")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from l2m_gtsam.cli.terminal import (
+    LOGS,
     OutOption,
     PosesOption,
     PoseTimesOption,
@@ -29,9 +30,7 @@ if TYPE_CHECKING:
 def slam(
     bag: Annotated[
         Path,
-        typer.Argument(
-            metavar="BAG", help="Drive with odometry, of the same kinds as for `calibrate`."
-        ),
+        typer.Argument(metavar="BAG", help=f"Drive with odometry: {LOGS}."),
     ],
     calibration: SensorsOption,
     out: OutOption,

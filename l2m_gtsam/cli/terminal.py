@@ -23,10 +23,9 @@ USUAL_WIDTH = 120  # of a file, or of whatever else is no terminal
 SPACE = 2  # between columns
 FEWEST_COLUMNS = 3  # of a table, on a terminal of any width
 ESTIMATE_S = 3600.0  # the time left follows from the pace over so many seconds
+LOGS = "ROS1 .bag, ROS2 folder, .db3, .mcap, .csv or .ulg"  # that drives are read from
 
-BagArgument = Annotated[
-    Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3, .mcap, .csv or .ulg.")
-]
+BagArgument = Annotated[Path, typer.Argument(metavar="BAG", help=f"{LOGS}.")]
 PosesOption = Annotated[
     list[Path] | None,
     typer.Option(
