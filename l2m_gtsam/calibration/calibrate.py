@@ -17,7 +17,7 @@ from l2m_gtsam.calibration.start.global_start import find_starts
 from l2m_gtsam.calibration.stretch_causes import with_causes
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.calibration.verdicts import SolvedDrive, sensor_verdicts
-from l2m_gtsam.calibration.view import Compilable, QueryableMap, RememberedMap
+from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, for_solvers
 from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile, Synchronised
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised, check_frame
@@ -112,7 +112,7 @@ def calibrated(
     check_frame(field_map, recording, map_source.path if map_source else "the map")
     synchronised = prepare(recording, options)
     alive = synchronised.readings.select(~stuck_readings(synchronised.readings))
-    compiled = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    compiled = for_solvers(field_map)
     solver_map = RememberedMap(compiled)
     priors = priors_of(options.priors, alive.sensors)
     found = _starts(alive, compiled, options, priors, progress)

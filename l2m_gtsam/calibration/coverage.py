@@ -19,7 +19,7 @@ from l2m_factors import M, P, Q, SharedError, U, map_weights_information, pose_e
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.pose_errors import PoseKnots, pose_seconds
-from l2m_gtsam.calibration.view import View
+from l2m_gtsam.calibration.view import View, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.parallel.threads import in_threads
 
@@ -72,7 +72,7 @@ class MovingFields:
         return (SharedError(Q(sensor), features.reshape(len(scaled), AXES, -1)),)
 
     def prior(self) -> gtsam.NonlinearFactorGraph:
-        """Return the prior of all weights: none, with unit variance."""
+        """Return the prior of all weights: zero mean, unit variance."""
         graph = gtsam.NonlinearFactorGraph()
         for key, size in self.sizes.items():
             unit = gtsam.noiseModel.Unit.Create(size)
@@ -316,7 +316,7 @@ class Coverage:
         return graph
 
     def prior_beside_tiles(self) -> gtsam.NonlinearFactorGraph:
-        """Return the prior of the weights of knots and of recorded numbers."""
+        """Return the prior of all weights but those of tiles."""
         graph = gtsam.NonlinearFactorGraph()
         if self.knots is not None:
             graph.push_back(pose_errors_prior(self.knots.correlation.tolist()))
@@ -343,8 +343,7 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
         How long an error of a pose lasts, seconds.
     """
     readings = view.readings
-    t = estimate.t[readings.sensor]
-    x = np.einsum("nij,nj->ni", readings.R_map_lidar, t) + readings.p_map_lidar
+    x = places_of(readings, estimate.t)
     seconds, knots = pose_seconds(readings), None
     if readings.pose_root is not None:
         knots = PoseKnots.over(seconds, correlation_s, readings.drive)

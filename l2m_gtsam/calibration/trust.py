@@ -10,7 +10,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
-from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.calibration.view import QueryableMap, View, places_of
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, Readings
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 from l2m_gtsam.solve.robust import (
@@ -205,6 +205,5 @@ def judged(
     readings: Readings, field_map: QueryableMap, estimate: Estimate, rejected: BoolArray
 ) -> JudgedReadings:
     """Return readings with their places, residuals and the verdict, shape (N,), of the solve."""
-    t = estimate.t[readings.sensor]
-    place = np.einsum("nij,nj->ni", readings.R_map_lidar, t) + readings.p_map_lidar
-    return JudgedReadings(readings, place, residuals(readings, field_map, estimate), rejected)
+    place, left = places_of(readings, estimate.t), residuals(readings, field_map, estimate)
+    return JudgedReadings(readings, place, left, rejected)
