@@ -43,7 +43,17 @@ def fixed_axes_step_factor(
 def fixed_axes_residual(
     poses: list[gtsam.Pose3], turn: gtsam.Rot3, way: FloatArray, jacobians: Jacobians
 ) -> FloatArray:
-    """Return e for the poses before and after a step; its derivatives go into ``jacobians``."""
+    """Return e for the poses before and after a step, rad and metres, shape (6,).
+
+    Parameters
+    ----------
+    poses
+        Before and after the step.
+    turn, way
+        As of ``fixed_axes_step_factor``.
+    jacobians
+        Takes the derivatives by both poses, (6, 6) each, unless it is absent.
+    """
     before, after = poses
     turned = before.rotation().between(after.rotation())
     off = turn.compose(before.rotation()).between(after.rotation())

@@ -6,8 +6,8 @@ r"""Magnetic readings whose prediction is uncertain, in ways that readings share
 
 ``gamma`` are weights that many readings have in common, with a prior: of the map's error in one
 tile, ``M(b)``, with ``F = R^T A``; of the lidar's pose error at a knot of the drive, ``P(k)``; of
-the field that recorded numbers add at a sensor, ``Q(i)``. F is given per reading, at the place
-where the graph is linearised; it changes over decimetres.
+the field that recorded numbers add at a sensor, ``Q(i)``; of any other error that has a key. F is
+given per reading, at the place where the graph is linearised; it changes over decimetres.
 """
 
 from collections.abc import Mapping, Sequence

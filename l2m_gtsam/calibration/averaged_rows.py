@@ -394,5 +394,6 @@ class _Sparse:
         self._parts.append((values.ravel(), at.ravel(), columns.ravel()))
 
     def matrix(self) -> csr_array:
+        """Return the matrix; entries at one place add up."""
         values, rows, columns = (np.concatenate(each) for each in zip(*self._parts, strict=True))
         return coo_array((values, (rows, columns)), shape=self._shape).tocsr()

@@ -337,7 +337,10 @@ def _solutions(
 
 
 def with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:
-    """Return the covariance without the made-up figures of directions that were held."""
+    """Return a sensor's covariance, (16, 16), infinite instead of what held directions have.
+
+    A parameter that such a direction touches has infinite variance and no correlation.
+    """
     determined, touched = covariance.copy(), np.append(test.touched, not test.offset)
     determined[touched, :] = 0.0
     determined[:, touched] = 0.0

@@ -181,7 +181,7 @@ class JointInformation:
     loose: FloatArray
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
-        """Return the covariance of the variables of some keys, in their order."""
+        """Return the covariance of the k variables of some keys, in their order, shape (k, k)."""
         return self.every.among(columns_at(self.columns, keys))
 
     def loosened(self, key: int, spread: FloatArray) -> "JointInformation":
@@ -195,13 +195,13 @@ class JointInformation:
         return replace(self, every=every, loose=loose)
 
     def loose_among(self, sensors: tuple[int, ...]) -> FloatArray:
-        """Return what ``among`` has beyond the system's covariance."""
+        """Return what ``among`` has beyond the system's covariance, shape (16 n, 16 n)."""
         keys = [key for sensor in sensors for key in keys_of(sensor)]
         root = self.loose[columns_at(self.columns, keys)]
         return np.asarray(root @ root.T)
 
     def of_system(self, sensors: tuple[int, ...]) -> FloatArray:
-        """Return ``among`` as the system has it."""
+        """Return ``among`` as the system has it, shape (16 n, 16 n)."""
         return self.among(sensors) - self.loose_among(sensors)
 
     def after_step(self, rows: Rows) -> Rows:
@@ -303,7 +303,7 @@ def joint_information(
 
 
 def root_by_qr(rows: Sequence[Rows], weights: FloatArray, scale: FloatArray) -> FloatArray:
-    """Return the lower triangular root of the scaled information without squaring any row.
+    """Return the lower triangular root of the scaled information, (n, n), without squaring a row.
 
     Where something is known 1e8 times better than its neighbours a squared row has nothing left of
     these. It takes a hundred times as long as Cholesky; memory stays bounded.

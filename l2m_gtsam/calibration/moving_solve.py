@@ -169,7 +169,15 @@ class MovingProblem:
     priors: Priors = NO_PRIORS
 
     def solved(self, t_start: FloatArray, fields: Mapping[int, Correction]) -> "Round":
-        """Solve without the fields of the sensors that some act on, and compare models."""
+        """Solve with the fields of numbers taken off readings, and compare models.
+
+        Parameters
+        ----------
+        t_start
+            Where to start each sensor in the lidar frame in metres, shape (S, 3).
+        fields
+            What numbers add to the readings of the sensors that they act on.
+        """
         given = without(self.readings, fields)
         solution = solve_one_key(
             given,

@@ -1,10 +1,12 @@
 """The one-key solve: from readings and a map to t, C, H and their uncertainty.
 
-The paper's algorithm 1 in two stages. The *alternation* brings t near: the distortion follows in
+The paper's algorithm 1, in three stages. The *alternation* brings t near: the distortion follows in
 closed form from what the map predicts at the current t (w-RRTLS), then the graph over all ``T(i)``
 moves the sensors, with the same weights inside and outside. The *joint* graph over ``T(i)`` and
-``D(i)`` then finishes both, with the full covariance of each reading, and its marginals are the
-uncertainty. All sensors are in one graph and share one evaluation of the map.
+``D(i)`` then finishes both, with the full covariance of each reading. Where readings share errors,
+as those of a map that knows its own, the *last* graph has these as variables, too (``uncertain``).
+The marginals of whichever comes last are the uncertainty. All sensors are in one graph and share
+one evaluation of the map.
 
 Where the lidar's motion separates a sensor's time offset from its place, ``S(i)`` is a variable,
 too; the readings' poses are taken anew as it moves.

@@ -424,7 +424,7 @@ def still_changing(
 
 
 def determined_rows(test: Determinacy, options: RankOptions) -> FloatArray | None:
-    """Return rows over the 16 parameters of a sensor whose place is open: what is determined.
+    """Return what is determined of a sensor whose place is open: rows over its parameters, (K, 16).
 
     None for others, of which all is looked at.
     """

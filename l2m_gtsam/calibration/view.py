@@ -159,7 +159,10 @@ def glimpse(
     t_few: FloatArray,
     min_readings: int,
 ) -> View:
-    """Return a view whose variance is that of a few readings, and the field its own."""
+    """Return a view whose variance is that of a few readings, and the field its own.
+
+    The variance is that where the few are with sensors at ``t_few``, metres, shape (S, 3).
+    """
     sample = stand_ins.sample(readings, field_map, estimate.t, t_few)
     return _view(readings, sample, len(estimate.t), min_readings)
 

@@ -10,7 +10,7 @@ from l2m_gtsam.records.calibration import ResidualFigures
 # Search range for a sensor's noise in uT: from below the resolution of any vehicle's magnetometer
 # to above the Earth's field.
 NOISE_RANGE = (1e-4, 1e3)
-HALF = 0.5  # below this weight a reading counts as rejected
+HALF = 0.5  # a reading of no more weight has no part in the estimate of the noise
 
 
 def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatArray) -> FloatArray:

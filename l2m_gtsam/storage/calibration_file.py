@@ -108,8 +108,9 @@ MODEL = {
     "disturbances": (
         "processes found beside noise and the map's errors, which covariances hold: wander of H, "
         "errors of poses that last, a drive's frame that is bent against the map's, a clock that "
-        "drifts, readings that are smoothed; sizes are standard deviations, gain is twice a "
-        "logarithm of likelihood"
+        "drifts, readings that are smoothed, a field that is not the map's for a time, H that "
+        "follows the vehicle's motion; sizes are standard deviations, gain is twice a logarithm "
+        "of likelihood"
     ),
     "stated": (
         "errors whose standard deviations were stated: ratio of what the readings show to what was "

@@ -84,7 +84,7 @@ class Budget:
         )
 
     def prior(self) -> gtsam.NonlinearFactorGraph:
-        """Return the prior of all weights: none, with unit variance."""
+        """Return the prior of all weights: zero mean, unit variance."""
         graph = gtsam.NonlinearFactorGraph()
         for key, size in self.sizes.items():
             unit = gtsam.noiseModel.Unit.Create(size)

@@ -135,7 +135,17 @@ def starts_of(
     bounds: Bounds,
     groups: Sequence[Rigid],
 ) -> list[list[FoundStart | None]]:
-    """Return where each sensor is, by centre, from readings at common poses."""
+    """Return where each sensor is, by centre, from readings at common poses.
+
+    Parameters
+    ----------
+    snapshots
+        The readings.
+    field_map, centres, options
+        As of ``find_starts_around``.
+    bounds, groups
+        Where sensors can be, and which of them move as one.
+    """
     coarse = coarse_prediction(field_map, options)
     balls = [Candidates.around(centre, options.search_radius, options.step) for centre in centres]
     union = Candidates.union(balls)
@@ -355,7 +365,10 @@ def start_candidates(
 
 
 def spread_out(places: FloatArray, apart: float, most: int) -> list[int]:
-    """Return at most so many rows, the first ones that keep a distance from those before."""
+    """Return at most so many rows, the first ones that keep a distance from those before.
+
+    Places, shape (N, 3), and the distance ``apart`` are in metres.
+    """
     picked: list[int] = []
     free = np.ones(len(places), dtype=np.bool_)
     while len(picked) < most and free.any():

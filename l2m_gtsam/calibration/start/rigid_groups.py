@@ -65,7 +65,10 @@ def rigid_groups(priors: Priors, sensors: Collection[int]) -> list[Rigid]:
 
 
 def reached(start: int, links: dict[int, list[tuple[int, FloatArray]]]) -> dict[int, FloatArray]:
-    """Return places from a start along links, the start's first."""
+    """Return places by sensor from a start along links, the start's first, in metres, (3,) each.
+
+    Links are vectors in the lidar frame from a sensor to others, metres, shape (3,).
+    """
     places = {start: np.zeros(3)}
     waiting = [start]
     while waiting:
