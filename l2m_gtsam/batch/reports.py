@@ -278,6 +278,10 @@ def holds_localisation(folder: Path) -> bool:
 
 def _report_calibration(folder: Path, config: Path | None, progress: Progress) -> Reported:
     source = folder / CALIBRATION_FILE
+    if not source.exists():
+        raise CalibrationError(
+            f"{source}: no such file; give a folder that `l2m calibrate` or `l2m slam` wrote to"
+        )
     found = read = read_calibration(source)
     metrics = read_metrics(folder / METRICS_FILE)
     digest = source_file(folder / METRICS_FILE).sha256

@@ -38,7 +38,7 @@ def inspect(
     times: PoseTimesOption = None,
     wide: WideOption = False,
 ) -> None:
-    """Say what is in a log and what would be used of it, and why; exit code 1 if nothing can be."""
+    """List what is in a log, what would be used and why; exit code 1 if it cannot be calibrated."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import inspect_file
         from l2m_gtsam.cli.tables.drives import bag_table
@@ -95,15 +95,15 @@ def plan(
         list[str] | None,
         typer.Option(
             metavar="X,Y,Z",
-            help="Assume a sensor at this place in the lidar frame (metres), instead of those of "
-            "the bag; may be repeated.",
+            help="Assume a sensor at this position in the lidar frame (metres), instead of those "
+            "of the bag; may be repeated.",
         ),
     ] = None,
     poses: PosesOption = None,
     times: PoseTimesOption = None,
     wide: WideOption = False,
 ) -> None:
-    """Say what a drive will determine, how well, and which extra motion would help most.
+    """Predict what a drive will determine, how accurately, and which extra motion helps most.
 
     From poses and map alone: the bag needs no readings. Sensors of the bag are assumed where
     `calibration.start` puts them, else at the lidar, aligned with it and without distortion.
@@ -154,7 +154,8 @@ def calibrate(
         ),
     ] = None,
     more: Annotated[
-        list[Path] | None, typer.Option("--bag", metavar="BAG", help="The same; may be repeated.")
+        list[Path] | None,
+        typer.Option("--bag", metavar="BAG", help="A drive, as BAG; may be repeated."),
     ] = None,
     config: ConfigOption = None,
     poses: PosesOption = None,

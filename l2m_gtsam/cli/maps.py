@@ -31,7 +31,7 @@ StructureOption = Annotated[
     typer.Option(
         "--structure",
         metavar="CLOUD",
-        help="What the LiDAR saw: .pcd, .ply, .las, .laz, .e57 or .npz in the map frame, or a "
+        help="The LiDAR's point cloud: .pcd, .ply, .las, .laz, .e57 or .npz in the map frame, or a "
         "PointCloud2 topic.",
     ),
 ]
@@ -69,8 +69,8 @@ def suite(
 ) -> None:
     """Calibrate a mapping suite from its own drive, before there is any map.
 
-    Poses have to be known well, the field does not: no field that can be looks the same to sensors
-    that sit or read otherwise.
+    Poses must be accurate; the field need not be known: no possible field fits the readings of
+    sensors with other positions or calibrations.
     """
     with shown_progress() as progress:
         from l2m_gtsam.batch.survey import calibrate_suite_file
@@ -172,7 +172,7 @@ def map_compare(
     times: PoseTimesOption = None,
     wide: WideOption = False,
 ) -> None:
-    """Say which kind of map predicts places best that it has not seen."""
+    """Compare kinds of map by how well they predict readings that were left out."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.maps import compare_map_kinds
         from l2m_gtsam.cli.tables.maps import comparison_table
@@ -185,7 +185,7 @@ def map_compare(
 
 @map_app.command("info")
 def map_info(map_path: MapArgument) -> None:
-    """Say what a map is made of and what it covers."""
+    """Describe a map: what it was made from, what it covers, how good it is."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.files import doubts_of_origin
         from l2m_gtsam.batch.maps import describe_map_file

@@ -86,9 +86,9 @@ def validate(
     strict: StrictOption = False,
     wide: WideOption = False,
 ) -> None:
-    """Say whether a calibration still holds: on another drive and map, or beside an older one.
+    """Test whether a calibration is still right: on another drive, or against an older one.
 
-    Readings are predicted from poses, map and calibration with all that is uncertain of these.
+    Readings are predicted from poses, map and calibration, with the uncertainty of all three.
     """
     with shown_progress() as progress:
         from l2m_gtsam.batch.validation import (

@@ -36,7 +36,7 @@ def slam(
     out: OutOption,
     map_path: Annotated[
         Path | None,
-        typer.Option("--map", help="Map file; without one the field is found with the poses."),
+        typer.Option("--map", help="Map file; without one, the field is estimated with the poses."),
     ] = None,
     truth: Annotated[
         Path | None,
@@ -57,7 +57,7 @@ def slam(
     strict: StrictOption = False,
     wide: WideOption = False,
 ) -> None:
-    """Find where a drive went: in a magnetic map, or in the unknown field along its path."""
+    """Localise a drive in a magnetic map, or estimate its path and the field together (SLAM)."""
     if resume and not online:
         raise ConfigError("--resume goes on with a run of --online: give both")
     with shown_progress() as progress:

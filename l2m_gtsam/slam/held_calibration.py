@@ -17,10 +17,10 @@ def held_notes(drive: Drive) -> tuple[str, ...]:
     worst = large[np.argmax(errors[large] / drive.sensors.noise[large])]
     named = ", ".join(names[:5]) + (" and others" if len(names) > 5 else "")
     note = (
-        f"the calibration is held, although its own sigmas put readings of {named} off by "
+        f"the calibration is fixed, although its own sigmas put readings of {named} off by "
         f"{errors[worst]:.2g} uT (1 sigma), more than their noise of "
-        f"{drive.sensors.noise[worst]:.2g} uT: poses may be off by far more than theirs say; give "
-        "`slam.calibration: refined`"
+        f"{drive.sensors.noise[worst]:.2g} uT: poses may be off by far more than their sigmas; "
+        "give `slam.calibration: refined`"
     )
     return (note,)
 

@@ -143,9 +143,8 @@ def decoy_notes(made: int, solved: int) -> tuple[str, ...]:
     if solved == made:
         return ()
     note = (
-        f"the map was compared with {solved} of {made} copies of it that are turned by 180 "
-        "degrees: in the others the drive has no solution, so that the test against another "
-        "place is weaker than usual"
+        f"the test against a map of another place is weaker than usual: the drive has a solution "
+        f"in {solved} of {made} decoys only (this map, turned by 180 degrees)"
     )
     return (note,)
 

@@ -265,8 +265,8 @@ class SlamOptions(Options):
     """Where the drive begins."""
     calibration: CalibrationUse = CalibrationUse.AUTO
     """`refined`: estimated with the poses, with its covariance as the prior, so that its sigmas are
-    in those of the poses. `fixed`: held as it is given. `auto`: refined, but fixed of one sensor
-    without map and scans, whose field would follow whatever its calibration becomes."""
+    in those of the poses. `fixed`: taken as exact. `auto`: refined; fixed for one sensor
+    without map and scans, where the estimated field would absorb errors of the calibration."""
     scans: Usage = Usage.USED
     """`used`: point clouds, if the bag has any, are registered on the cloud of the map, or on each
     other where places are come to again; or `ignored`."""
@@ -328,6 +328,6 @@ def refuse_offline_only(options: SlamOptions, *, has_map: bool, one_field: bool)
         raise ConfigError("`slam.start.anywhere` searches a map for the start: give one with --map")
     if options.calibration is CalibrationUse.REFINED and one_field:
         raise ConfigError(
-            "`slam.calibration: refined` of one sensor without a map works off line; on line give "
-            "`fixed`"
+            "`slam.calibration: refined` of one sensor without a map works off line only; on line "
+            "give `auto` or `fixed`"
         )

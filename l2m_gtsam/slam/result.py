@@ -157,11 +157,13 @@ def _verdict(
         )
         return LocalisationStatus.OUTSIDE_MAP, message
     if judged < LEAST_EXPLAINED or max(chi2, solution.odometry_chi2) > LARGEST_CHI2:
-        left = f", leaves {chi2:.1f} times the variance of their noise" if np.isfinite(chi2) else ""
+        noisy = np.isfinite(chi2) and chi2 > LARGEST_CHI2
+        left = f", to {chi2:.1f} times the variance of their noise" if noisy else ""
+        times = solution.odometry_chi2
+        bent = f", and poses contradict odometry by {times:.1f} times its variance"
         message = (
-            f"{explains}{left}, and needs steps "
-            f"that differ from odometry by {solution.odometry_chi2:.1f} times its variance: "
-            "another place, a wrong start, or a wrong calibration"
+            f"{explains}{left}{bent if times > LARGEST_CHI2 else ''}: another place, a wrong "
+            "start, or a wrong calibration"
         )
         return LocalisationStatus.NOT_HERE, message
     if fits_decoy_as_well(solution, decoys):

@@ -30,12 +30,12 @@ Formulas, frames and units stand under `model`; each sensor has its own entry un
 FIRST_VERSION = {"uncertainty": Uncertainty.INDEPENDENT.value, "doubts": (), "disagreements": ()}
 UNCERTAINTY = {
     Uncertainty.FULL: (
-        "sigmas carry the map's errors as they are: shared by readings near each other and by all "
-        "sensors; they hold as far as the map explains its own field (`l2m map info`)"
+        "sigmas include the map's errors, which readings near each other and all sensors share; "
+        "they are right as far as the map explains its own field (`l2m map info`)"
     ),
     Uncertainty.INDEPENDENT: (
         "sigmas count the map's errors as independent from reading to reading; where the map is "
-        "less sure than the sensor they are too small"
+        "less accurate than the sensor they are too small"
     ),
 }
 

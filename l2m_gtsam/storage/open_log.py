@@ -41,7 +41,9 @@ def open_log(path: Path, columns: ColumnOptions | None = None) -> Iterator[Log]:
         No such file, of no kind that is read, damaged, or without messages.
     """
     if path.suffix.lower() in (".txt", ".dat", ".log", ".tsv") and path.is_file():
-        raise BagError(f"{path}: its name does not state its format; call a table .csv")
+        raise BagError(
+            f"{path}: its name does not state its format; call a table .csv; accepted: {ACCEPTED}"
+        )
     if not is_table(path):
         with open_bag(path) as bag:
             yield bag

@@ -40,7 +40,7 @@ def test_the_sensors_of_a_bag(yard: Yard, field_map: Path) -> None:
     for motion in ("heave", "roll", "pitch", "turn round", "other way round", "a loop of 0.5 m"):
         assert motion in out
     assert "helps mag most: " in out
-    assert "sigmas carry the map's errors as they are" in out
+    assert "sigmas include the map's errors" in out
     assert "l2m: warning: " in run.err
 
 

@@ -72,7 +72,7 @@ def test_the_commands_of_the_page_run(
     on_drive, compared, both = outs
     assert "e_B before" in on_drive
     assert "verdict: FAIL" not in on_drive
-    assert "offset H is not as calibrated" not in on_drive
+    assert "offset H differs from the calibration" not in on_drive
     assert "No change since the old calibration" in compared
     assert "No change since the old calibration" in both
     found = read_validation(Path("validated/validation.json"))
@@ -120,7 +120,7 @@ def test_a_magnet_on_the_vehicle_is_named(
     found = validate_calibration(asked, silent)
     told = "\n".join(found.verdict.lines(Level.PASS))
     assert "verdict: FAIL" in told
-    assert "On this drive its offset H is not as calibrated, by 3.0 µT" in told
+    assert "On this drive its offset H differs from the calibration by 3.0 µT" in told
     assert read_validation(tmp_path / "out" / "validation.json").verdict == found.verdict
     assert {each.role for each in found.sources} == {"calibration", "drive", "map"}
 

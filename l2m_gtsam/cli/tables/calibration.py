@@ -22,7 +22,7 @@ HEADINGS = (
     "± (mm)",
     "H (uT)",
     "± (uT)",
-    "turned (deg)",
+    "rotation (deg)",
     "± (deg)",
     "clock (ms)",
     "rms (uT)",

@@ -84,7 +84,7 @@ def map_table(description: MapDescription) -> Table:
     for heading in ("fact", "value"):
         table.add_column(heading)
     table.add_row("kind", summary.kind)
-    table.add_row("readings given, rows kept", f"{summary.readings:,}, {summary.rows:,}")
+    table.add_row("readings given, kept", f"{summary.readings:,}, {summary.rows:,}")
     for axis, low, high in zip("xyz", summary.lower, summary.upper, strict=True):
         table.add_row(f"readings along {axis}", f"{low:.2f} to {high:.2f} m")
     for name, value in summary.facts.items():

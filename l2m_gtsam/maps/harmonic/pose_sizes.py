@@ -80,8 +80,8 @@ class FoundPoses:
         return (
             f"the survey's poses are off by about {tilt:.2g} deg of tilt, {heading:.2g} deg of "
             f"heading, {floor:.2g} mm on the floor and {height:.2g} mm of height for "
-            f"{self.lasting_s:g} s, by the survey itself: sigmas hold that; state how wrong they "
-            "are if it is known (mapping.pose_noise)"
+            f"{self.lasting_s:g} s, by the survey itself: sigmas include that; state how wrong "
+            "they are if it is known (mapping.pose_noise)"
         )
 
 

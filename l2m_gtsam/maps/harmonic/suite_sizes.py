@@ -75,8 +75,8 @@ class SuiteSizes:
         return (
             "the survey's sensors are off by about "
             f"{1e3 * self.t_m:.1f} mm, {self.C:.2%} of the field and {self.H_ut:.2g} uT each, "
-            "by the survey itself: sigmas hold that; calibrate them, and state how well that is "
-            "known (--suite)"
+            "by the survey itself: sigmas include that; calibrate them, and state how well that "
+            "is known (--suite)"
         )
 
 

@@ -120,12 +120,12 @@ def _exact(result: CalibrationResult) -> list[Reason]:
         reasons.append(Reason(Level.PASS, text))
     if size := result.unseen_warp_m:
         text = (
-            f"Readings leave it open whether the drive's frame is bent by {1e3 * size:.1f} mm; "
-            "sigmas hold it."
+            f"The drive's frame may be bent against the map's by {1e3 * size:.1f} mm: the readings "
+            "would not show it. Sigmas include it."
         )
         reasons.append(Reason(Level.PASS, text))
     if result.exact:
-        reasons.append(Reason(Level.PASS, f"Taken for exact: {', '.join(result.exact)}."))
+        reasons.append(Reason(Level.PASS, f"Taken as exact: {', '.join(result.exact)}."))
     return reasons
 
 

@@ -238,8 +238,8 @@ def _sigmas(record: LocalisationRecord) -> list[Reason]:
         reasons.append(Reason(Level.WARN, text))
     if not record.refined:
         text = (
-            "The calibration is held as it is given: its own sigmas, stated or assumed, are not in "
-            "those of the poses (`slam.calibration`)."
+            "The calibration is fixed (`slam.calibration`): its own sigmas, stated or assumed, are "
+            "not in those of the poses."
         )
         reasons.append(Reason(Level.PASS, text))
     return reasons

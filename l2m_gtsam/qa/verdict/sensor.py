@@ -213,7 +213,7 @@ def precision(case: Case) -> list[Reason]:
     sensor, options = case.sensor, case.options
     t, H = _largest(sensor.t_sigma), _largest(sensor.H_sigma)
     angle = np.rad2deg(_largest(np.sqrt(np.diag(sensor.rotation_covariance))))
-    place = f"Its place is only known to ± {sigma_alone(1e3 * t)} mm (1 sigma)."
+    place = f"Its position is only known to ± {sigma_alone(1e3 * t)} mm (1 sigma)."
     offset = f"Its offset H is only known to ± {sigma_alone(H)} µT."
     rotation = f"Its rotation is only known to ± {sigma_alone(angle)}°."
     return [

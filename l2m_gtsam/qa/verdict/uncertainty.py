@@ -162,37 +162,37 @@ def disturbance_sentence(found: Disturbance) -> str:
             )
         case DisturbanceKind.POSES:
             return (
-                f"Poses are wrong by about {size}, by the readings themselves. Sigmas hold it; "
-                "state the errors of your poses (calibration.solve.pose_noise), or use better "
-                "ones."
+                f"Poses are wrong by about {size}, by the readings themselves. Sigmas include "
+                "it; state the errors of your poses (calibration.solve.pose_noise), or use "
+                "better ones."
             )
         case DisturbanceKind.FIELD:
             return (
                 f"The field differs from the map's by {size}, for all sensors alike: steel or "
                 "currents near by changed, or the survey missed what is along the path. Sigmas "
-                "hold it; survey more densely, or again."
+                "include it; survey more densely, or again."
             )
         case DisturbanceKind.WARP:
             return (
-                f"The frame of the drive is bent against the map's by about {size}. Sigmas hold "
-                "it; use poses on the same point cloud for survey and drive."
+                f"The frame of the drive is bent against the map's by about {size}. Sigmas "
+                "include it; use poses on the same point cloud for survey and drive."
             )
         case DisturbanceKind.CLOCK:
             return (
                 f"The clock of {found.sensor} drifts against that of the poses by about {size}. "
-                "Sigmas hold it, and the time offset is that of the middle of the drive; stamp "
+                "Sigmas include it, and the time offset is that of the middle of the drive; stamp "
                 "readings and poses by one clock."
             )
         case DisturbanceKind.SMOOTHING:
             return (
                 f"Readings of {found.sensor} are smoothed over about {size} against the poses, as "
-                "by a low-pass filter. Sigmas hold it, and the time offset is the filter's mean "
-                "delay; switch filters off, or drive more slowly."
+                "by a low-pass filter. Sigmas include it, and the time offset is the filter's "
+                "mean delay; switch filters off, or drive more slowly."
             )
         case DisturbanceKind.MOVING_PARTS:
             return (
-                f"H of {found.sensor} follows how the vehicle moves: by {size}. Sigmas hold it. "
-                "Iron steers near it, or motors draw currents: record these and name them "
+                f"H of {found.sensor} follows how the vehicle moves: by {size}. Sigmas include "
+                "it. Iron steers near it, or motors draw currents: record these and name them "
                 "(bag.regressors), or mount it further away."
             )
 

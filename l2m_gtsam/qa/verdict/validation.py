@@ -135,9 +135,11 @@ def _changed(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     share = sensor.rejected / (sensor.readings + sensor.rejected)
     doubt = ""
     if options.rejected.level(share) is not Level.PASS:
-        doubt = " (Readings were rejected, see below; what else differs near these pulls at this.)"
+        doubt = " (Readings were rejected, see below; other changes near them may bias this.)"
     return [
-        _change(each, options, "On this drive {name} is not as calibrated, by {amount}", doubt)
+        _change(
+            each, options, "On this drive {name} differ{s} from the calibration by {amount}", doubt
+        )
         for each in sensor.changes
     ]
 
@@ -145,7 +147,9 @@ def _changed(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
 def _change(change: CalibrationChange, options: QaOptions, text: str, doubt: str = "") -> Reason:
     """Return a change as a reason; a negligible one is only a note."""
     level = limits_of(options.validation)[change.part].level(change.size)
-    what = text.format(name=NAMES[change.part], amount=by_how_much(change))
+    several = change.part in (CalibrationPart.GAINS, CalibrationPart.ANGLES)
+    s, has = ("", "have") if several else ("s", "has")
+    what = text.format(name=NAMES[change.part], s=s, has=has, amount=by_how_much(change))
     what = what[0].upper() + what[1:]
     if level is Level.PASS:
         return Reason(level, f"{what}: significant but negligible.")
@@ -190,7 +194,7 @@ def _blind(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     ]
     if not hidden:
         return []
-    text = f"This drive cannot rule out a change that fails: {', '.join(hidden)}."
+    text = f"This drive cannot rule out a change that would FAIL: {', '.join(hidden)}."
     return [Reason(Level.WARN, text)]
 
 
@@ -207,7 +211,7 @@ def _on_comparison(sensor: ComparedSensor, options: QaOptions) -> list[Reason]:
         return [Reason(Level.WARN, "The two calibrations determine nothing of it in common.")]
     if sensor.changes:
         return [
-            _change(each, options, "since the old calibration {name} has changed by {amount}")
+            _change(each, options, "since the old calibration {name} {has} changed by {amount}")
             for each in sensor.changes
         ]
     if whole.chance < options.validation.chance / (len(NAMES)):

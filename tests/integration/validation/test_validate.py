@@ -357,7 +357,7 @@ def test_a_vehicle_at_rest_tests_too_little() -> None:
     found = validate(parked, STRONG, calibrated(), options, 1e-3)
     verdict = judged(found)
     assert verdict.level == "warn"
-    assert "cannot rule out a change that fails: its" in text_of(verdict, "mag_0")
+    assert "cannot rule out a change that would FAIL: its" in text_of(verdict, "mag_0")
 
 
 @pytest.mark.parametrize(("less", "more"), [(0.1, 1.0), (1.0, 10.0)])

@@ -182,7 +182,7 @@ def test_what_sigmas_leave_out_is_reported() -> None:
     assert "standard deviations come out too small" in texts(blind, Level.WARN)[0]
     fixed = judged(replace(good(), refined=()))
     assert fixed.level is Level.PASS
-    assert any("held as it is given" in each for each in texts(fixed, Level.PASS))
+    assert any("calibration is fixed" in each for each in texts(fixed, Level.PASS))
     nothing = tuple(replace(each, covariance=None) for each in good().poses)
     unknown = judged(replace(good(), poses=nothing))
     assert texts(unknown, Level.WARN) == ["The uncertainty of the poses is not known."]

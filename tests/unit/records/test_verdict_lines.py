@@ -12,7 +12,7 @@ from l2m_gtsam.records.verdict import (
     judged_lines,
 )
 
-NOTE = Reason(Level.PASS, "Taken for exact: the survey's poses.")
+NOTE = Reason(Level.PASS, "Taken as exact: the survey's poses.")
 GRAVE = Reason(Level.FAIL, "An axis is dead.")
 
 
@@ -33,7 +33,7 @@ def test_reasons_keep_their_level() -> None:
 
 
 APART = Reason(Level.FAIL, "It does not repeat.")
-LOOSE = Reason(Level.WARN, "Its place is only known to ± 12 mm (1 sigma).")
+LOOSE = Reason(Level.WARN, "Its position is only known to ± 12 mm (1 sigma).")
 
 
 def test_reasons_that_other_thresholds_remove_are_named() -> None:
