@@ -244,7 +244,7 @@ class Coverage:
     lower
         Cholesky root of the covariance of all tiles' weights, shape (K, K).
     knots
-        Where pose errors are variables; absent where poses are taken for exact.
+        Where pose errors are variables; absent where poses are taken as exact.
     seconds
         When each pose was taken, as the knots count, shape (N,).
     moving

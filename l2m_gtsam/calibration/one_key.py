@@ -108,7 +108,7 @@ class OneKeySolution:
     stated
         How large errors are whose sigmas were stated, where shared errors are counted.
     pose_duration
-        How long errors of poses last; none where these are taken for exact, or no map was asked.
+        How long errors of poses last; none where these are taken as exact, or no map was asked.
     by_parts
         The sensors by the scatter of parts of the drive alone, where that is asked for.
     unseen_warp_m

@@ -105,7 +105,7 @@ class SharedErrors:
 def duration_of_poses(
     view: View, field_map: QueryableMap, near: Estimate, options: PoseNoiseOptions
 ) -> PoseDuration | None:
-    """Return how long errors of poses last; None where poses are taken for exact.
+    """Return how long errors of poses last; None where poses are taken as exact.
 
     Parameters
     ----------

@@ -153,7 +153,7 @@ class SegmentMeans(PoseKnots):
 def error_of_poses(readings: Readings, field_map: QueryableMap, estimate: Estimate) -> FloatArray:
     """Return F of readings at an estimate, uT in the lidar frame, shape (N, 3, 6).
 
-    It is zero where poses are taken for exact.
+    It is zero where poses are taken as exact.
     """
     if readings.pose_root is None:
         return np.zeros((len(readings), 3, 6))

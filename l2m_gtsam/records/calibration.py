@@ -383,16 +383,16 @@ class CalibrationResult:
     exact
         What counts as exact, for want of errors that are stated.
     disturbances
-        What was found beside noise and the map's errors; sigmas hold it.
+        What was found beside noise and the map's errors; sigmas include it.
     stated
         How large errors are of which sigmas were stated, by the readings.
     pose_duration
-        How long errors of poses last; none where these are taken for exact.
+        How long errors of poses last; none where these are taken as exact.
     sources
         Of field that came, went or were moved since the place was mapped; the solve includes them.
     unseen_warp_m
         Shifts of the drive's frame against the map's that readings leave possible, root mean square
-        along each axis of the floor in metres; sigmas hold them. Absent where a bend was found.
+        along each axis of the floor in metres; sigmas include them. Absent where a bend was found.
     recorded
         When each drive was recorded, and which frames its poses are of, in the order of `drives`.
     map_origin

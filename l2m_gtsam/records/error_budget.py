@@ -79,7 +79,7 @@ class DisturbanceKind(StrEnum):
 
 @dataclass(frozen=True)
 class Disturbance:
-    """A process that was found on a drive, and that sigmas hold.
+    """A process that was found on a drive, and that sigmas include.
 
     Attributes
     ----------

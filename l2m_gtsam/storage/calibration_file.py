@@ -90,7 +90,7 @@ MODEL = {
     ),
     "unmodelled": (
         "how many times larger variances are than noise, map and poses explain, from the scatter "
-        "of parts of the drive; covariance and sigmas hold it; absent where nothing is"
+        "of parts of the drive; covariance and sigmas include it; absent where nothing is"
     ),
     "variance_shares": (
         "what each cause has of the variances of t, C and H, as shares of one: noise of the "
