@@ -13,9 +13,9 @@ from l2m_gtsam.records.localisation import Explored, LocalisationResult, Localis
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import EXACT_START, Drive
-from l2m_gtsam.slam.held_calibration import held_notes
+from l2m_gtsam.slam.held_calibration import held_notes, with_calibration_use
 from l2m_gtsam.slam.localisation import NO_SCANS, prepared
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, with_calibration_use
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.slips import judged, with_open_jumps, with_recorded_jumps
@@ -99,7 +99,7 @@ def explore(
     progress("learning the field's prior", 0.0)
     by_scans = without_field(with_open_jumps(drive), options)
     drive = replace(drive, links=drive.links[by_scans.believed])
-    options = with_calibration_use(options, one_field=has_one_sensor(drive))
+    options = with_calibration_use(options, drive.sensors, one_field=has_one_sensor(drive))
     odometry = judged(
         drive,
         lambda each: solve_field(each, options, progress).solution,

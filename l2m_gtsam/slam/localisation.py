@@ -20,18 +20,12 @@ from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, odometry_jumps
-from l2m_gtsam.slam.held_calibration import held_notes
+from l2m_gtsam.slam.held_calibration import held_notes, with_calibration_use
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import key_pose_links, link_stamps
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
-from l2m_gtsam.slam.options import (
-    CalibrationUse,
-    SlamOptions,
-    StartPoseOptions,
-    StepAxes,
-    with_calibration_use,
-)
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.slips import judged, with_open_jumps
@@ -104,8 +98,8 @@ def localise(
         )
     if options.start.by_odometry:
         check_frame(field_map, recording)
-    options = with_calibration_use(options, one_field=False)
     drive, notes = prepared(recording, calibration, options, evidence)
+    options = with_calibration_use(options, drive.sensors, one_field=False)
     solver_map = for_solvers(field_map)
     search = None
     if options.start.anywhere:

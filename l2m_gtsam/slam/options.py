@@ -265,8 +265,9 @@ class SlamOptions(Options):
     """Where the drive begins."""
     calibration: CalibrationUse = CalibrationUse.AUTO
     """`refined`: estimated with the poses, with its covariance as the prior, so that its sigmas are
-    in those of the poses. `fixed`: taken as exact. `auto`: refined; fixed for one sensor
-    without map and scans, where the estimated field would absorb errors of the calibration."""
+    in those of the poses. `fixed`: taken as exact. `auto`: refined; fixed where its sigmas are so
+    small that readings do not show them, and for one sensor without map and scans, where the
+    estimated field would absorb errors of the calibration."""
     scans: Usage = Usage.USED
     """`used`: point clouds, if the bag has any, are registered on the cloud of the map, or on each
     other where places are come to again; or `ignored`."""
@@ -281,22 +282,6 @@ class SlamOptions(Options):
     """How data are taken on line."""
     max_iterations: int = Field(default=50, ge=1)
     """The most steps of the optimiser in each round."""
-
-
-def with_calibration_use(options: SlamOptions, *, one_field: bool) -> SlamOptions:
-    """Return options in which `calibration` is `fixed` or `refined`.
-
-    Parameters
-    ----------
-    options
-        As they are given.
-    one_field
-        Whether there is a single sensor and nothing else that knows its places.
-    """
-    if options.calibration is not CalibrationUse.AUTO:
-        return options
-    use = CalibrationUse.FIXED if one_field else CalibrationUse.REFINED
-    return options.model_copy(update={"calibration": use})
 
 
 def refuse_offline_only(options: SlamOptions, *, has_map: bool, one_field: bool) -> None:

@@ -22,6 +22,7 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import StartVerdict
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose, as_transform
+from l2m_gtsam.slam.held_calibration import with_calibration_use
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.localisation import is_determined, known_sensors, start_pose
 from l2m_gtsam.slam.online.belief import Belief
@@ -35,7 +36,6 @@ from l2m_gtsam.slam.options import (
     CalibrationUse,
     SlamOptions,
     refuse_offline_only,
-    with_calibration_use,
 )
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
@@ -140,8 +140,8 @@ class OnlineSlam:
             raise CalibrationError("no sensor has a calibration that can be used")
         self._one_field = field_map is None and matcher is None and len(usable) == 1
         refuse_offline_only(options, has_map=field_map is not None, one_field=self._one_field)
-        self.options = with_calibration_use(options, one_field=self._one_field)
         self.sensors = known_sensors(usable)
+        self.options = with_calibration_use(options, self.sensors, one_field=self._one_field)
         self._map = None if field_map is None else for_solvers(field_map)
         self.matcher = matcher
         axes = None if field_map is None else np.array([1.0, 1.0, options.drift.of_height])

@@ -48,11 +48,15 @@ def test_a_known_map_takes_the_drift_out() -> None:
     assert result.drift.end_m == pytest.approx(end, abs=0.1)
 
 
-def test_a_calibration_is_refined_unless_it_is_fixed() -> None:
+def test_a_calibration_is_refined_unless_it_is_fixed_or_known_too_well() -> None:
     sensors, drive = small_hall(11, seconds=12)
-    for use in CalibrationUse:
-        result = located(drive, dipole_world(1), calibrated(sensors), calibration=use.value)
-        assert (result.calibration is None) == (use is CalibrationUse.FIXED)
+    known, exact = calibrated(sensors, sigma=WIDE), calibrated(sensors)
+    refined = [
+        located(drive, dipole_world(1), each, calibration=use.value).calibration is not None
+        for each in (known, exact)
+        for use in (CalibrationUse.AUTO, CalibrationUse.FIXED, CalibrationUse.REFINED)
+    ]
+    assert refined == [True, False, True, False, False, True]
 
 
 def test_a_calibration_that_is_off_is_refined() -> None:
@@ -117,7 +121,7 @@ def test_a_decoy_without_a_solution_is_no_evidence_for_the_map(
     monkeypatch.setattr("l2m_gtsam.slam.localisation.needs_misfit_test", lambda _: True)
     sensors, drive = small_hall(14, seconds=12)
     result = located(drive, dipole_world(1), calibrated(sensors))
-    assert any("0 of 2 copies" in note for note in result.notes)
+    assert any("in 0 of 2 decoys" in note for note in result.notes)
 
 
 def test_a_start_elsewhere_can_be_given() -> None:

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.held_calibration import held_errors, held_notes
+from l2m_gtsam.slam.held_calibration import (
+    expected_errors,
+    held_errors,
+    held_notes,
+    with_calibration_use,
+)
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from tests.drives.localised import localised
 
 
@@ -55,3 +61,33 @@ def test_a_calibration_known_worse_than_a_reading_is_told_of() -> None:
     (note,) = held_notes(drive_with(0.005, 0.3))
     assert "slam.calibration: refined" in note
     assert held_notes(drive_with(1e-4, 0.01)) == ()
+
+
+def test_errors_in_a_field_of_any_direction_are_those_of_drawn_calibrations() -> None:
+    sensors = drive_with(0.005, 0.3).sensors
+    rng, count = np.random.default_rng(1), 20_000
+    towards = rng.normal(size=(count, 3))
+    b = 50.0 * towards / np.linalg.norm(towards, axis=1)[:, None]
+    drawn = np.einsum("nij,nj->ni", rng.normal(0, 0.005, (count, 3, 3)), b)
+    drawn += rng.normal(0, 0.3, (count, 3))
+    # And 1 mm in 10 uT/m. Of 60,000 axes the rms is found within 0.3 %.
+    whole = np.hypot(np.sqrt(np.mean(drawn**2)), 1e-3 * 10.0)
+    np.testing.assert_allclose(expected_errors(sensors), whole, rtol=0.015)
+
+
+@pytest.mark.parametrize(
+    ("sigma_C", "sigma_H", "one_field", "use"),
+    [
+        (5e-3, 0.3, False, CalibrationUse.REFINED),
+        (5e-3, 0.3, True, CalibrationUse.FIXED),
+        (1e-6, 1e-5, False, CalibrationUse.FIXED),
+    ],
+)
+def test_auto_refines_what_readings_would_show(
+    sigma_C: float, sigma_H: float, one_field: bool, use: CalibrationUse
+) -> None:
+    sensors = drive_with(sigma_C, sigma_H).sensors
+    assert with_calibration_use(SlamOptions(), sensors, one_field=one_field).calibration is use
+    for given in (CalibrationUse.FIXED, CalibrationUse.REFINED):
+        options = SlamOptions(calibration=given)
+        assert with_calibration_use(options, sensors, one_field=one_field) == options
