@@ -154,7 +154,7 @@ def _check_sources(out: Path, *sources: Path | None) -> None:
     """Raise an OutputError if a result would take the place of what it is made from."""
     check_outputs(out)
     if any(each is not None and out.exists() and out.samefile(each) for each in sources):
-        raise OutputError(f"{out}: is what is read; choose another --out")
+        raise OutputError(f"{out}: would be overwritten, but is read; choose another --out")
 
 
 def _edited(export: Export, urdf: Path) -> bytes:

@@ -310,7 +310,7 @@ def _check_folder(out: Path) -> None:
 def check_not_replaced(calibration: Path, out: Path) -> None:
     """Raise an OutputError if the refined calibration would be written over what is read."""
     if (out / REFINED_FILE).exists() and calibration.samefile(out / REFINED_FILE):
-        raise OutputError(f"{calibration}: is what is read; choose another --out")
+        raise OutputError(f"{calibration}: would be overwritten, but is read; choose another --out")
 
 
 def write_refined(out: Path, calibration: CalibrationResult) -> None:

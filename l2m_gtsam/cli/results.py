@@ -86,7 +86,7 @@ def validate(
     strict: StrictOption = False,
     wide: WideOption = False,
 ) -> None:
-    """Test whether a calibration is still right: on another drive, or against an older one.
+    """Test whether a calibration is still valid: on another drive, or against an older one.
 
     Readings are predicted from poses, map and calibration, with the uncertainty of all three.
     """

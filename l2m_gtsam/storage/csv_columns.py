@@ -167,7 +167,8 @@ def _stamp(
             if _timeless(part.text) == wanted:
                 return (k,), _time_unit(part)
     raise ValueError(
-        "no column with times is known by its name; name it with `columns.stamp`; there are: "
+        "no column with times is known by its name; name it with `columns.stamp`, under `bag` "
+        "for a log, under `bag.pose_file` for poses; there are: "
         f"{', '.join(part.text for part in parts[:30])}"
     )
 

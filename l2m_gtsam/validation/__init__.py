@@ -1,1 +1,1 @@
-"""Whether a calibration still holds on another drive."""
+"""Whether a calibration is still valid on another drive."""

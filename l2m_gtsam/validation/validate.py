@@ -1,4 +1,4 @@
-"""Recording + map + calibration -> how far the calibration still holds. Pure: no files."""
+"""Recording + map + calibration -> how far the calibration is still valid. Pure: no files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

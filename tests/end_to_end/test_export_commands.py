@@ -69,7 +69,7 @@ def test_a_robot_gets_the_sensor(calibration: Path, tmp_path: Path) -> None:
     assert "<joint" not in robot.read_text()
     assert "no link 'lidar' for the LiDAR" in complaint_here(*common, "--out", tmp_path / "x")
     line = complaint_here(*common, "--lidar-frame", "top", "--out", robot)
-    assert "is what is read; choose another --out" in line
+    assert "would be overwritten, but is read; choose another --out" in line
     assert not (tmp_path / "x").exists()
 
 
