@@ -137,9 +137,9 @@ def slam_online(
         run = _Run(begun, log, out / STATE_FILE, config.slam.online.save_every_s)
         scans = () if matcher is None else bag_scans(given.bag, config, silent)
         run.drive(recording, scans, progress)
-    refines = begun.slam.options.calibration is CalibrationUse.REFINED
-    last = run.last if refines else None
-    _write_calibration_so_far(last, calibration, given, recording, config, out)
+    is_refined = begun.slam.options.calibration is CalibrationUse.REFINED
+    refined_by = run.last if is_refined else None
+    _write_calibration_so_far(refined_by, calibration, given, recording, config, out)
     trajectory = logged_trajectory(run.lines)
     write_tum(out / TRAJECTORY_FILE, trajectory)
     if saved is None:
@@ -273,7 +273,7 @@ def _write_calibration_so_far(
     config: Config,
     out: Path,
 ) -> None:
-    """Write the calibration as the last pose has it, if there is one and it was refined."""
+    """Write the calibration as the last pose that refined it has it; without one there is none."""
     (out / REFINED_FILE).unlink(missing_ok=True)
     if last is None:
         return

@@ -17,7 +17,7 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.options import KeyPoseOptions
-from l2m_gtsam.studies.slam_array.places import slipping
+from l2m_gtsam.studies.slam_array.odometry import slipping
 from tests.drives.calibrations import calibration, sensor
 from tests.worlds.exact import dipole_world, random_sensors
 

@@ -32,11 +32,7 @@ from l2m_gtsam.slam.online.intake import Intake, trajectory_of
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
 from l2m_gtsam.slam.online.odometry_check import OdometryPose
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanLinks, ScanMatcher
-from l2m_gtsam.slam.options import (
-    CalibrationUse,
-    SlamOptions,
-    refuse_offline_only,
-)
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, refuse_offline_only
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision

@@ -23,7 +23,7 @@ from l2m_gtsam.slam.online.replay import messages
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
-from l2m_gtsam.studies.slam_array.places import slipping
+from l2m_gtsam.studies.slam_array.odometry import slipping
 from tests.drives.motion_capture import QUICK, mapped, read
 from tests.drives.online import driven
 from tests.support.pose_errors import pose_nees, position_error

@@ -14,7 +14,7 @@ from l2m_gtsam.slam.localisation import localise, prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.slips import judged
 from l2m_gtsam.slam.smoother import localise_drive
-from l2m_gtsam.studies.slam_array.places import slipping
+from l2m_gtsam.studies.slam_array.odometry import slipping
 from l2m_gtsam.studies.slam_array.robot import other_passes, robot_pass
 from tests.drives.faults import jumped, shift
 from tests.drives.slam import COARSE, calibrated, rounds, slam_drive

@@ -18,7 +18,7 @@ from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions, TfChain
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.trajectory_files import TOPIC, LocalisedMotion, write_trajectory_bag
-from l2m_gtsam.studies.slam_array.places import slipping
+from l2m_gtsam.studies.slam_array.odometry import slipping
 from tests.drives.slam import rounds
 
 EVERY = 7  # a key pose

@@ -29,7 +29,7 @@ from l2m_gtsam.slam.unknown_field.return_search import (
 )
 from l2m_gtsam.slam.unknown_field.tiled_stages import FOLLOWED
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
-from l2m_gtsam.studies.slam_array.places import slipping
+from l2m_gtsam.studies.slam_array.odometry import slipping
 from tests.drives.slam import calibrated, laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 

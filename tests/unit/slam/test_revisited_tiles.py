@@ -11,7 +11,7 @@ from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field import revisited_tiles
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from l2m_gtsam.slam.unknown_field.tiles import anchor_tiles, drive_prior
-from l2m_gtsam.studies.slam_array.places import slipping
+from l2m_gtsam.studies.slam_array.odometry import slipping
 from tests.drives.slam import calibrated, laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 

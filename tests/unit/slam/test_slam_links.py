@@ -19,7 +19,7 @@ from l2m_gtsam.slam.links import MAP, key_pose_links, link_stamps
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
-from l2m_gtsam.studies.slam_array.places import slipping
+from l2m_gtsam.studies.slam_array.odometry import slipping
 from tests.drives.slam import rounds
 
 SIGMA = np.repeat([0.002, 0.01], 3)  # of a registration, rad and m

@@ -12,7 +12,7 @@ from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.peers.exact_loops import AWAY_M, closed_by_exact_loops, exact_loops
 from l2m_gtsam.studies.slam.methods import given_sensors, rms
-from l2m_gtsam.studies.slam_array.places import walked
+from l2m_gtsam.studies.slam_array.odometry import walked
 from tests.drives.slam import laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 

@@ -8,7 +8,7 @@ from l2m_gtsam.slam.options import DriftOptions
 from l2m_gtsam.studies.peers.particle_filters import MapParticlesOptions, map_particles
 from l2m_gtsam.studies.peers.reduced_rank_ekf import FilteredPath
 from l2m_gtsam.studies.slam.methods import rms, squared_errors
-from l2m_gtsam.studies.slam_array.places import walked
+from l2m_gtsam.studies.slam_array.odometry import walked
 from tests.drives.slam import laps
 from tests.worlds.exact import dipole_world
 
