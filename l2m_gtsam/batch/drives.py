@@ -53,19 +53,6 @@ def inspect_file(bag: Path, config: Config, progress: Progress) -> BagReport:
     return inspect_bag(bag, config.bag, counter(f"reading {bag.name}", progress))
 
 
-def calibrate_bag(
-    bag: Path,
-    map_path: Path,
-    config: Config,
-    out: Path,
-    progress: Progress,
-    truth: tuple[KnownSensor, ...] = (),
-    view: Path | None = None,
-) -> CalibrationResult:
-    """Calibrate all magnetometers of a bag, as `calibrate_bags` does."""
-    return calibrate_bags([bag], map_path, config, out, progress, truth, view).result
-
-
 def calibrate_bags(
     bags: Sequence[Path],
     map_path: Path,

@@ -12,6 +12,7 @@ from l2m_gtsam.cli.terminal import (
     WideOption,
     WorkersOption,
     print_table,
+    print_verdict,
     say,
     shown_progress,
 )
@@ -59,10 +60,10 @@ def demo(
 ) -> None:
     """Simulate, map and calibrate a warehouse, and compare with the truth."""
     with shown_progress() as progress:
-        from l2m_gtsam.batch.drives import OVERVIEW_FILE, calibrate_bag
+        from l2m_gtsam.batch.drives import OVERVIEW_FILE, calibrate_bags
         from l2m_gtsam.batch.files import ensure_folder
         from l2m_gtsam.batch.maps import build_map_file
-        from l2m_gtsam.batch.reports import REPORT_FILE, calibration_results, report_folder
+        from l2m_gtsam.batch.reports import REPORT_FILE, calibration_results, report_calibration
         from l2m_gtsam.batch.simulation import STRUCTURE_FILE, SUITE_FILE, bag_name, simulate_bags
         from l2m_gtsam.cli.tables.calibration import consistency_note, truth_table
         from l2m_gtsam.config import Config
@@ -75,10 +76,11 @@ def demo(
         cloud = str(out / STRUCTURE_FILE)
         build_map_file([mapping], map_path, chosen, out / SUITE_FILE, progress, cloud)
         with calibration_results(out) as stage:
-            result = calibrate_bag(drive, map_path, chosen, stage, progress, truth)
-            report_folder(stage, None, progress)
-    print_table(truth_table(result, truth), wide)
-    say(consistency_note(result, truth))
+            found = calibrate_bags([drive], map_path, chosen, stage, progress, truth)
+            verdict = report_calibration(stage, found, chosen.qa, progress)
+    print_table(truth_table(found.result, truth), wide)
+    say(consistency_note(found.result, truth))
+    print_verdict(verdict)
     picture, page = out / OVERVIEW_FILE, out / REPORT_FILE
     say(f"picture: {picture}; report: {page}; everything else is in {out}")
 

@@ -65,7 +65,7 @@ def test_the_reference_has_what_people_call(site: Path) -> None:
         "l2m_gtsam.planning.plan.plan",
         "l2m_gtsam.records.calibration.SensorCalibration",
         "l2m_gtsam.maps.harmonic.harmonic_map.HarmonicMap",
-        "l2m_gtsam.batch.drives.calibrate_bag",
+        "l2m_gtsam.batch.drives.calibrate_bags",
         "l2m_factors.reading.reading_factor",
     ):
         assert f'id="{name}"' in inside
