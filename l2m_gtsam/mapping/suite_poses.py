@@ -23,13 +23,10 @@ from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.mapping.shifts import survey_poses
 from l2m_gtsam.mapping.suite_likelihood import WindowSlopes, window_slopes
 from l2m_gtsam.mapping.suite_solver import SuiteRound, likeness
-from l2m_gtsam.maps.harmonic.pose_sizes import LASTING_S, PARTS, FoundPoses, PoseView, likely
+from l2m_gtsam.maps.harmonic.pose_sizes import PARTS, FoundPoses, PoseView, most_likely
 from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.solve.variance_components import WeightSystem, noise_left
-
-LEAST_SHARE = 0.03  # of the noise's variance: errors that do less to a reading are left out
-LEAST_GAIN = 16.0  # twice a logarithm of likelihood, as for a map
 
 
 @dataclass(frozen=True)
@@ -104,6 +101,10 @@ class PosedSurvey:
             found.append(PosesInWindow(PoseView(system, part, squares, by_unit), E, crossed))
         return found
 
+    def views(self, unit: FloatArray, lasting_s: float) -> list[PoseView]:
+        """Return what each window says of errors that last so long, by a unit of each, (6,)."""
+        return [each.view for each in self.seen(unit, lasting_s)]
+
 
 def with_pose_errors(
     last: SuiteRound, trajectory: Trajectory, options: PoseNoiseOptions, prior: FloatArray
@@ -136,7 +137,7 @@ def with_pose_errors(
         # Errors that every pose has of its own are noise of each reading, which is learnt.
         lasting = known[0].duration_stated or gain_as_stated(seen) > 0
         return PosedRound(widened(survey, seen) if lasting else last)
-    found = pose_sizes_of(survey)
+    found = most_likely(survey.views, last.windows.prior.noise)
     if found is None:
         return PosedRound(last)
     return PosedRound(widened(survey, survey.seen(found.sizes, found.lasting_s)), found)
@@ -145,26 +146,6 @@ def with_pose_errors(
 def gain_as_stated(seen: Sequence[PosesInWindow]) -> float:
     """Return the logarithm of likelihood beyond that of exact poses."""
     return sum(each.view.system.posterior(np.ones(len(each.view.part))).likelihood for each in seen)
-
-
-def pose_sizes_of(survey: PosedSurvey) -> FoundPoses | None:
-    """Return how wrong the poses are; None where the survey shows nothing of it."""
-    parts = np.unique(PARTS)
-    found: list[FoundPoses] = []
-    for lasting_s in LASTING_S:
-        unit = np.isin(PARTS, parts).astype(np.float64)
-        views = [each.view for each in survey.seen(unit, lasting_s)]
-        if not found:  # of these parts, those that matter
-            sizes = likely(views, parts, known=False).sizes
-            variance = np.mean([each.by_unit for each in views], axis=0) * sizes
-            parts = np.flatnonzero(variance > LEAST_SHARE * survey.last.windows.prior.noise**2)
-            if not len(parts):
-                return None
-            views = [each.among(parts) for each in views]
-        fit = likely(views, parts, known=False)
-        found.append(FoundPoses(np.sqrt(fit.sizes)[PARTS], lasting_s, fit.noise, fit.gain))
-    best = max(found, key=lambda each: each.gain)
-    return best if best.gain > LEAST_GAIN and best.credible else None
 
 
 def widened(survey: PosedSurvey, seen: Sequence[PosesInWindow]) -> SuiteRound:
