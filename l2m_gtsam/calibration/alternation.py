@@ -179,7 +179,8 @@ def fit_distortions(view: View, estimate: Estimate, options: OneKeyOptions) -> E
         fit = fit_distortion(b_lidar, b_meas, weights, options.closed_form)
         distortion[s] = fit.distortion.vector()
         if options.sensor_noise_ut is None:
-            noise[s] = estimate_noise(fit.distortion.apply(b_lidar) - b_meas, v, DISTORTION)
+            residual = fit.distortion.apply(b_lidar) - b_meas
+            noise[s] = estimate_noise(residual, v, 1 - DISTORTION / residual.size)
         ridge[s] = fit.ridge * ridge_unit(b_lidar, 1 / (v + noise[s] ** 2))
     return replace(estimate, distortion=distortion, noise=noise, ridge=ridge)
 

@@ -254,7 +254,7 @@ def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
         rows, taken = problem.batch.rows_of(s), problem.determinacies[s].free
         rows = rows[problem.view.trust[rows] > HALF]
         residual = problem.batch.residuals(values, s).residual[rows]
-        noise[s] = estimate_noise(residual, variance[rows], taken)
+        noise[s] = estimate_noise(residual, variance[rows], 1 - taken / residual.size)
     return noise
 
 

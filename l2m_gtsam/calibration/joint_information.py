@@ -147,10 +147,45 @@ class HalfCovariance:
         root = np.column_stack([np.empty((len(self), 0)), *added])
         return HalfCovariance(self.scale, half), root
 
+    def blocks(self, at: IntArray, J: FloatArray, size: int) -> FloatArray:
+        """Return the blocks of ``J Sigma J^T`` about its diagonal, shape (m / size, size, size).
+
+        J is by some variables, shape (m, k).
+        """
+        scaled = J * self.scale[at]
+        half = scaled @ submatrix(self.half, at)
+        parts = scaled.reshape(-1, size, len(at)), half.reshape(-1, size, len(at))
+        found = parts[1] @ parts[0].transpose(0, 2, 1)
+        return np.asarray(found + found.transpose(0, 2, 1))
+
     def trace(self, at: IntArray, J: FloatArray) -> float:
         """Return the trace of ``J Sigma J^T`` for J by some variables, shape (m, k)."""
         scaled = J * self.scale[at]
         return 2 * float(upper_product(self.half, at, scaled.T @ scaled))
+
+
+def leverage(every: HalfCovariance, rows: Rows, whitening: FloatArray) -> FloatArray:
+    """Return the share of each reading's variance that a fit takes of its residual, shape (n,).
+
+    Of the residual as it is: a white one mixes readings whose poses' errors have much in common,
+    and a reading at a knot of these is fitted far closer than one between two.
+
+    Parameters
+    ----------
+    every
+        Covariance of all variables.
+    rows
+        White rows of n readings.
+    whitening
+        What made them white, (n, 3, 3), or lower triangular (3 n, 3 n).
+    """
+    size = whitening.shape[-1]
+    # What made white, undone: a root of each block's covariance.
+    root = np.linalg.solve(whitening.reshape(-1, size, size), np.eye(size))
+    taken = every.blocks(rows.columns, rows.jacobian, size)
+    fitted = np.einsum("bij,bjk,bik->bi", root, taken, root, optimize=True)
+    whole = np.einsum("bij,bij->bi", root, root)
+    return np.asarray(fitted.reshape(-1, 3).sum(axis=1) / whole.reshape(-1, 3).sum(axis=1))
 
 
 @dataclass(frozen=True)

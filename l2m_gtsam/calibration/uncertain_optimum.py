@@ -24,7 +24,7 @@ from l2m_gtsam.calibration.half_difference import (
     second_half,
 )
 from l2m_gtsam.calibration.joint import SensorSolution, with_infinities
-from l2m_gtsam.calibration.joint_information import JointInformation, Rows, columns_at
+from l2m_gtsam.calibration.joint_information import JointInformation, Rows, columns_at, leverage
 from l2m_gtsam.calibration.optimise import joint_covariance
 from l2m_gtsam.calibration.parts_alone import ByParts, by_parts
 from l2m_gtsam.calibration.priors import contradictions
@@ -73,7 +73,7 @@ class UncertainOptimum:
         for s in self._view.sensors:
             rows = self.problem.batch.rows_of(s)
             rows = rows[self._view.trust[rows] > HALF]
-            noise[s] = estimate_noise(self._residual[rows], rest[rows], self._taken(s))
+            noise[s] = estimate_noise(self._residual[rows], rest[rows], self._left[rows])
         return noise
 
     def solutions(self) -> tuple[SensorSolution, ...]:
@@ -225,6 +225,18 @@ class UncertainOptimum:
         for group, readings in zip(self._coverage.groups, self.problem.groups, strict=True):
             residual[group.rows] = readings.residual(self.values)
         return residual
+
+    @cached_property
+    def _left(self) -> FloatArray:
+        """Share of the variance of each reading's residual that the fit leaves, shape (N,)."""
+        left = np.ones(len(self._residual))
+        for rows, white in zip(
+            [each for each in self.joint.rows if len(each.readings)],
+            self.problem.noise.whitenings,
+            strict=True,
+        ):
+            left[rows.readings] = 1 - leverage(self.joint.every, rows, white)
+        return left
 
     @cached_property
     def _rows(self) -> list[Rows]:

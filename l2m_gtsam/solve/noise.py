@@ -10,6 +10,7 @@ from l2m_gtsam.records.calibration import ResidualFigures
 # Search range for a sensor's noise in uT: from below the resolution of any vehicle's magnetometer
 # to above the Earth's field.
 NOISE_RANGE = (1e-4, 1e3)
+LEAST_LEFT = 0.5  # of a residual's variance by a fit
 HALF = 0.5  # a reading of no more weight has no part in the estimate of the noise
 
 
@@ -108,13 +109,15 @@ def write_inverse_roots(covariance: FloatArray, W: FloatArray) -> bool:
     return True
 
 
-def estimate_noise(residual: FloatArray, map_variance: FloatArray, taken: float) -> float:
+def estimate_noise(
+    residual: FloatArray, map_variance: FloatArray, left: FloatArray | float
+) -> float:
     """Return the most likely standard deviation of a sensor's noise in uT.
 
     The residuals are modelled as independent normal numbers of variance
     ``sigma^2 + map_variance``; what the map's variance already explains is not counted again.
-    A fit leaves less than that: its residuals are as small as if some of them were zero
-    (restricted maximum likelihood, Patterson and Thompson 1971, where all variances are equal).
+    A fit leaves less than that of them (restricted maximum likelihood, Patterson and Thompson
+    1971, where all variances are equal).
 
     Parameters
     ----------
@@ -122,13 +125,13 @@ def estimate_noise(residual: FloatArray, map_variance: FloatArray, taken: float)
         Residuals in uT, shape (N, 3).
     map_variance
         Mean variance of the map's prediction in uT^2, shape (N,).
-    taken
-        Degrees of freedom that the fit took: the number of its free parameters, less for those
-        with a prior. At least half of the values are counted.
+    left
+        Share of each residual's variance that the fit leaves, shape (N,), or of all of them. No
+        less than half is counted.
     """
-    # Bessel: each fitted parameter takes one degree of freedom from the residuals.
-    left = max(residual.size - taken, residual.size / 2)
-    e2, v = residual**2 * (residual.size / left), map_variance[:, None]
+    # Bessel: what is fitted to a reading is missing in its residual.
+    e2 = residual**2 / np.reshape(np.maximum(left, LEAST_LEFT), (-1, 1))
+    v = map_variance[:, None]
 
     # Derivative of -2 log likelihood by sigma^2; over log sigma, as the range spans seven decades.
     def score(log_sigma: float) -> float:

@@ -57,7 +57,7 @@ def test_sensor_noise_is_separated_from_the_maps(sigma: float) -> None:
     rng = np.random.default_rng(2)
     v = rng.uniform(0, 0.04, 10_000)
     residual = rng.normal(size=(10_000, 3)) * np.sqrt(sigma**2 + v)[:, None]
-    assert estimate_noise(residual, v, taken=0) == pytest.approx(sigma, rel=0.06)
+    assert estimate_noise(residual, v, 1.0) == pytest.approx(sigma, rel=0.06)
 
 
 def test_what_a_fit_took_is_not_taken_for_quiet() -> None:
@@ -69,14 +69,33 @@ def test_what_a_fit_took_is_not_taken_for_quiet() -> None:
     A = rng.normal(size=(30, 12))
     outside = np.eye(30) - A @ np.linalg.pinv(A)
     squares = [
-        estimate_noise((outside @ rng.normal(0, 0.2, 30)).reshape(10, 3), np.zeros(10), 12) ** 2
+        estimate_noise((outside @ rng.normal(0, 0.2, 30)).reshape(10, 3), np.zeros(10), 0.6) ** 2
         for _ in range(2000)
     ]
     assert np.sqrt(np.mean(squares)) == pytest.approx(0.2, rel=0.02)
 
 
+def test_readings_that_a_fit_follows_more_closely_count_by_what_is_left_of_them() -> None:
+    """Half of the readings are quiet and followed closely: with the mean share of all, sigma comes
+    out 5 % too small. 2,000 draws of 120 numbers have a standard error of 0.2 %."""
+    rng, count = np.random.default_rng(5), 40
+    v = np.repeat([0.0, 0.16], count // 2)
+    total = np.repeat(0.04 + v, 3)
+    A = rng.normal(size=(3 * count, 12)) * np.repeat(np.repeat([1.0, 0.1], count // 2), 3)[:, None]
+    fitted = A @ np.linalg.solve(A.T @ (A / total[:, None]), A.T)
+    left = 1 - np.diag(fitted).reshape(-1, 3).sum(axis=1) / total.reshape(-1, 3).sum(axis=1)
+    outside = np.eye(3 * count) - fitted / total
+    each, even = [], []
+    for _ in range(2000):
+        residual = (outside @ (np.sqrt(total) * rng.standard_normal(3 * count))).reshape(-1, 3)
+        each.append(estimate_noise(residual, v, left) ** 2)
+        even.append(estimate_noise(residual, v, 1 - 12 / (3 * count)) ** 2)
+    assert np.sqrt(np.mean(each)) == pytest.approx(0.2, rel=0.01)
+    assert np.sqrt(np.mean(even)) < 0.193
+
+
 def test_noise_of_residuals_below_the_maps_own_is_the_floor() -> None:
-    assert estimate_noise(np.zeros((10, 3)), np.ones(10), taken=0) == pytest.approx(1e-4)
+    assert estimate_noise(np.zeros((10, 3)), np.ones(10), 1.0) == pytest.approx(1e-4)
 
 
 def test_figures_of_known_residuals() -> None:
