@@ -6,8 +6,8 @@ integer nanoseconds.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +43,43 @@ class InFile:
             handler.generate_schema(self.type),
             serialization=core_schema.plain_serializer_function_ser_schema(np.ndarray.tolist),
         )
+
+
+Table = TypeVar("Table")
+
+
+def joined(parts: Sequence[Table]) -> Table:
+    """Return tables of arrays as one, the rows of each after those of the one before.
+
+    Parameters
+    ----------
+    parts
+        At least one, all of one dataclass. Its fields are arrays with a value for each row, such
+        tables themselves, or the same in all parts.
+    """
+
+    def column(values: Sequence[Any]) -> Any:
+        if is_dataclass(values[0]):
+            return joined(values)
+        return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
+
+    first: Any = parts[0]
+    names = [each.name for each in fields(first)]
+    whole: Table = type(first)(*(column([getattr(e, name) for e in parts]) for name in names))
+    return whole
+
+
+def chosen_rows(table: Table, rows: IntArray | BoolArray) -> Table:
+    """Return chosen rows of a table of arrays as in ``joined``."""
+
+    def chosen(values: Any) -> Any:
+        if is_dataclass(values):
+            return chosen_rows(values, rows)
+        return values[rows] if isinstance(values, np.ndarray) else values
+
+    whole: Any = table
+    part: Table = type(whole)(*(chosen(getattr(whole, each.name)) for each in fields(whole)))
+    return part
 
 
 Row3 = tuple[float, float, float]
@@ -105,13 +142,7 @@ class Trajectory:
         return len(self.stamp_ns)
 
     def __getitem__(self, rows: IntArray | BoolArray) -> "Trajectory":
-        return replace(
-            self,
-            stamp_ns=self.stamp_ns[rows],
-            R=self.R[rows],
-            p=self.p[rows],
-            covariance=None if self.covariance is None else self.covariance[rows],
-        )
+        return chosen_rows(self, rows)
 
 
 @dataclass(frozen=True)
@@ -247,14 +278,10 @@ class LidarMotion:
     @classmethod
     def joined(cls, parts: Sequence["LidarMotion"]) -> "LidarMotion":
         """Return the motion at all readings of some parts."""
-        return cls(
-            np.concatenate([each.twist_lidar for each in parts]),
-            np.concatenate([each.acceleration_lidar for each in parts]),
-            np.concatenate([each.offset for each in parts]),
-        )
+        return joined(parts)
 
     def __getitem__(self, rows: IntArray) -> "LidarMotion":
-        return LidarMotion(self.twist_lidar[rows], self.acceleration_lidar[rows], self.offset[rows])
+        return chosen_rows(self, rows)
 
 
 @dataclass(frozen=True)
@@ -302,18 +329,7 @@ class Readings:
         return len(self.sensor)
 
     def __getitem__(self, rows: IntArray) -> "Readings":
-        return Readings(
-            self.sensors,
-            self.sensor[rows],
-            self.stamp_ns[rows],
-            self.R_map_lidar[rows],
-            self.p_map_lidar[rows],
-            self.field[rows],
-            None if self.motion is None else self.motion[rows],
-            None if self.pose_root is None else self.pose_root[rows],
-            None if self.regressors is None else self.regressors[rows],
-            None if self.drive is None else self.drive[rows],
-        )
+        return chosen_rows(self, rows)
 
     @property
     def of_drive(self) -> IntArray:

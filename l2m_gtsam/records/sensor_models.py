@@ -17,7 +17,16 @@ from typing import Annotated, Self
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FloatArray, InFile, IntArray, Matrix, Row3, Vector
+from l2m_gtsam.data import (
+    BoolArray,
+    FloatArray,
+    InFile,
+    IntArray,
+    Matrix,
+    Row3,
+    Vector,
+    chosen_rows,
+)
 
 ONE_DRIVE = (slice(None),)  # all rows
 
@@ -77,15 +86,7 @@ class Samples:
         return len(self.z)
 
     def __getitem__(self, rows: IntArray | BoolArray) -> "Samples":
-        return Samples(
-            self.z[rows],
-            self.b[rows],
-            self.db_dt[rows],
-            self.q[rows],
-            self.weights[rows],
-            self.names,
-            None if self.drive is None else self.drive[rows],
-        )
+        return chosen_rows(self, rows)
 
     @property
     def drives(self) -> tuple[slice, ...]:

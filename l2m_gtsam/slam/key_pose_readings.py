@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from l2m_factors import KeyPoseReadings
-from l2m_gtsam.data import FloatArray, IntArray, Readings, Trajectory
+from l2m_gtsam.data import FloatArray, IntArray, Readings, Trajectory, joined
 from l2m_gtsam.geometry import turn_angle
 
 ARM_M = 1.0  # lever arm that converts a rotation into a distance
@@ -66,15 +66,7 @@ def no_readings() -> KeyPoseReadings:
 
 def joined_readings(parts: Sequence[KeyPoseReadings]) -> KeyPoseReadings:
     """Return readings of some key poses, whose clocks are no variables, as one."""
-    parts = [no_readings(), *parts]
-    return KeyPoseReadings(
-        np.concatenate([each.key_pose for each in parts]),
-        np.concatenate([each.sensor for each in parts]),
-        np.concatenate([each.R_key_lidar for each in parts]),
-        np.concatenate([each.p_key_lidar for each in parts]),
-        np.concatenate([each.fraction for each in parts]),
-        np.concatenate([each.field for each in parts]),
-    )
+    return joined([no_readings(), *parts])
 
 
 def _key_poses(readings: Readings, trajectory: Trajectory, rows: IntArray) -> IntArray:

@@ -1,11 +1,17 @@
 """Scan registrations of a drive as links of its key poses."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform, Trajectory
+from l2m_gtsam.data import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RigidTransform,
+    Trajectory,
+    chosen_rows,
+)
 from l2m_gtsam.geometry import between, compose, moved
 from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.recording.sync import interpolated
@@ -42,30 +48,13 @@ class Links:
         return len(self.key_pose)
 
     def __getitem__(self, rows: IntArray | BoolArray) -> "Links":
-        return Links(
-            self.origin[rows],
-            self.key_pose[rows],
-            self.R[rows],
-            self.p[rows],
-            self.covariance[rows],
-        )
+        return chosen_rows(self, rows)
 
     @classmethod
     def none(cls) -> "Links":
         """Return the links of a drive without scans."""
         no = np.empty(0, dtype=np.int64)
         return cls(no, no, np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 6, 6)))
-
-    @classmethod
-    def joined(cls, parts: Sequence["Links"]) -> "Links":
-        """Return the links of some parts of a drive as one."""
-        return cls(
-            np.concatenate([each.origin for each in parts]),
-            np.concatenate([each.key_pose for each in parts]),
-            np.concatenate([each.R for each in parts]),
-            np.concatenate([each.p for each in parts]),
-            np.concatenate([each.covariance for each in parts]),
-        )
 
     @classmethod
     def single(cls, origin: int, key_pose: int, found: PoseEstimate) -> "Links":

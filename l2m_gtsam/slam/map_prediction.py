@@ -5,7 +5,7 @@ noise of each reading they would average out, which they do not: a parked vehicl
 learn its place ever better.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -87,29 +87,6 @@ class MapPrediction:
     map_variance: FloatArray
     residual: FloatArray
     by_lidar: FloatArray
-
-    @classmethod
-    def joined(cls, parts: Sequence["MapPrediction"], rows: Sequence[IntArray]) -> "MapPrediction":
-        """Return predictions of parts of N readings as one, by the rows that each part has."""
-        order = np.argsort(np.concatenate(rows))
-        placed = [each.placed for each in parts]
-        readings = [each.readings for each in placed]
-        return cls(
-            PlacedReadings(
-                MagneticReadings(
-                    np.concatenate([each.sensor for each in readings])[order],
-                    np.concatenate([each.R_map_lidar for each in readings])[order],
-                    np.concatenate([each.p_map_lidar for each in readings])[order],
-                    np.concatenate([each.field for each in readings])[order],
-                ),
-                np.concatenate([each.x for each in placed])[order],
-                np.concatenate([each.C for each in placed])[order],
-            ),
-            np.concatenate([each.inside for each in parts])[order],
-            np.concatenate([each.map_variance for each in parts])[order],
-            np.concatenate([each.residual for each in parts])[order],
-            np.concatenate([each.by_lidar for each in parts])[order],
-        )
 
     def whitening(
         self,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
-from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
+from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory, joined
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.maps.field_map import Surveyed
@@ -23,7 +23,6 @@ from l2m_gtsam.records.localisation import StartVerdict
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose, as_transform
 from l2m_gtsam.slam.held_calibration import with_calibration_use
-from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.localisation import is_determined, known_sensors, start_pose
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
@@ -323,7 +322,7 @@ class OnlineSlam:
     def _linked(self, key_pose: ArrivedKeyPose, found: ScanLinks) -> ArrivedKeyPose:
         for text in found.refused:
             self._report(EventKind.SCAN_REFUSED, text)
-        return replace(key_pose, links=Links.joined([key_pose.links, found.links]), scans=())
+        return replace(key_pose, links=joined([key_pose.links, found.links]), scans=())
 
     def _count(self, seen: int, used: int) -> None:
         """Report when the map explains few of the last readings, and when it does again."""

@@ -16,7 +16,7 @@ from l2m_factors import (
     joint_residual,
     tile_residual,
 )
-from l2m_gtsam.data import FieldSample, FloatArray, IntArray
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray, chosen_rows, joined
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, predict
 from l2m_gtsam.slam.pose_graph import successive
@@ -187,7 +187,8 @@ class TiledDrive:
         """Return the tiles' predictions of all N readings, each in the frame of its anchor."""
         tiles = self.tiles
         parts = [tile.prediction(values.atVector(M(tile.number)), sensors) for tile in tiles]
-        return MapPrediction.joined(parts, [tile.rows for tile in tiles])
+        order = np.argsort(np.concatenate([tile.rows for tile in tiles]))
+        return chosen_rows(joined(parts), order)
 
     def penalties(
         self, noise: FloatArray, weights: FloatArray, squared: FloatArray
