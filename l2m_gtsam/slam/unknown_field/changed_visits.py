@@ -18,6 +18,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky, eigh, solve_triangular
 
+from l2m_factors import skew
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 
@@ -240,8 +241,3 @@ def trusted(tile: LinearField, seen: Seen) -> Seen:
     field, _ = tile.field_and_gradient(seen.points, weights)
     squared = np.sum((seen.field - field) ** 2 / seen.variance, axis=1)
     return seen[np.asarray(squared <= SPIKE**2)]
-
-
-def skew(v: FloatArray) -> FloatArray:
-    """Return the matrices of the cross products with vectors, (n, 3): (n, 3, 3)."""
-    return np.cross(v[:, None], np.eye(3)).transpose(0, 2, 1)
