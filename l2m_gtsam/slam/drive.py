@@ -190,7 +190,7 @@ class Drive:
         if drift is None or self.steps.steady is None:
             return self
         added = np.einsum("nij,ij->nj", self.steps.steady, drift.reshape(2, 3))
-        R = np.stack([pose.rotation().matrix() for pose in poses[:-1]])
+        R, _ = stacked(poses[:-1])
         own, fixed = np.einsum("nji,nj->ni", R, added), self.steps.fixed_axes
         if fixed is not None:
             fixed = fixed - added @ self.start.T_map_lidar.R
@@ -225,6 +225,12 @@ def odometry_jumps(
 def as_pose(transform: RigidTransform) -> gtsam.Pose3:
     """Return a transform as GTSAM's pose."""
     return gtsam.Pose3(gtsam.Rot3(transform.R), transform.t)
+
+
+def stacked(poses: Sequence[gtsam.Pose3]) -> tuple[FloatArray, FloatArray]:
+    """Return rotations (K, 3, 3) and positions (K, 3) in metres."""
+    R = np.stack([pose.rotation().matrix() for pose in poses])
+    return R, np.stack([pose.translation() for pose in poses])
 
 
 def as_transform(pose: gtsam.Pose3) -> RigidTransform:

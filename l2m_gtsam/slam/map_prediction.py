@@ -5,7 +5,7 @@ noise of each reading they would average out, which they do not: a parked vehicl
 learn its place ever better.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -26,7 +26,7 @@ from l2m_factors import (
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
-from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.drive import KnownSensors, stacked
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 
 
@@ -132,7 +132,9 @@ class MapPrediction:
 
 
 def place_readings(
-    readings: KeyPoseReadings, poses: Mapping[int, gtsam.Pose3], sensors: KnownSensors
+    readings: KeyPoseReadings,
+    poses: Mapping[int, gtsam.Pose3] | Sequence[gtsam.Pose3],
+    sensors: KnownSensors,
 ) -> PlacedReadings:
     """Return readings at poses in the map.
 
@@ -146,11 +148,8 @@ def place_readings(
         Estimates of the S sensors.
     """
     numbers, slot = np.unique(readings.key_pose, return_inverse=True)
-    own = [poses[int(k)] for k in numbers]
-    R = np.stack([pose.rotation().matrix() for pose in own])[slot]
-    p = np.stack([pose.translation() for pose in own])[slot]
-    at = readings.placed(R, p)
-    return PlacedReadings.of(at, sensors)
+    R, p = stacked([poses[int(k)] for k in numbers])
+    return PlacedReadings.of(readings.placed(R[slot], p[slot]), sensors)
 
 
 def predict(field_map: QueryableMap, where: PlacedReadings, sensors: KnownSensors) -> MapPrediction:
@@ -167,9 +166,9 @@ def predict(field_map: QueryableMap, where: PlacedReadings, sensors: KnownSensor
     return MapPrediction(where, sample.inside, sample.variance, predicted - at.field, by_lidar)
 
 
-def poses_in(values: gtsam.Values, count: int) -> dict[int, gtsam.Pose3]:
-    """Return the key poses of a drive by number."""
-    return {k: values.atPose3(X(k)) for k in range(count)}
+def poses_in(values: gtsam.Values, count: int) -> list[gtsam.Pose3]:
+    """Return the key poses of a drive."""
+    return [values.atPose3(X(k)) for k in range(count)]
 
 
 def sensors_in(values: gtsam.Values, known: KnownSensors) -> KnownSensors:

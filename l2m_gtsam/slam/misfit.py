@@ -11,7 +11,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray
-from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.drive import Drive, stacked
 from l2m_gtsam.slam.solution import DriveSolution
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
@@ -80,7 +80,7 @@ def needs_misfit_test(solution: DriveSolution) -> bool:
 
 def decoy_maps(drive: Drive, field_map: QueryableMap) -> tuple[DecoyMap, ...]:
     """Return decoys turned about the centre of a drive, and about a point beside it."""
-    p = np.stack([pose.translation() for pose in drive.dead_reckoning()])
+    _, p = stacked(drive.dead_reckoning())
     middle, extent = p.mean(axis=0), np.ptp(p, axis=0)
     beside = np.where(np.arange(AXES) == np.argmax(extent[:2]), extent / 6, 0.0)
     return DecoyMap(field_map, middle), DecoyMap(field_map, middle + beside)

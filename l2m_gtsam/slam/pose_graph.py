@@ -186,6 +186,13 @@ def drive_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
 def drive_values(drive: Drive, poses: list[gtsam.Pose3]) -> gtsam.Values:
     """Return what these factors are on, at K key poses."""
     values = shared_values(drive)
+    values.insert(pose_values(poses))
+    return values
+
+
+def pose_values(poses: list[gtsam.Pose3]) -> gtsam.Values:
+    """Return K key poses as variables."""
+    values = gtsam.Values()
     for k, pose in enumerate(poses):
         values.insert(X(k), pose)
     return values
@@ -231,11 +238,11 @@ def solve_pose_graph(drive: Drive, confidence: float) -> PoseGraph:
     graph = odometry_graph(replace(drive, steps=plain))
     sure = graph.size()
     graph.push_back(link_graph(drive.links))
-    optimizer = gtsam.GncLMOptimizer(graph, _values(poses), _params(sure))
+    optimizer = gtsam.GncLMOptimizer(graph, pose_values(poses), _params(sure))
     optimizer.setInlierCostThresholdsAtProbability(confidence)
     found = poses_in(optimizer.optimize(), len(poses))
     believed = np.asarray(optimizer.getWeights())[sure:] > HALF
-    return PoseGraph(list(found.values()), believed)
+    return PoseGraph(found, believed)
 
 
 def _params(sure: int) -> gtsam.GncLMParams:
@@ -248,23 +255,14 @@ def _params(sure: int) -> gtsam.GncLMParams:
     return params
 
 
-def _values(poses: list[gtsam.Pose3]) -> gtsam.Values:
-    values = gtsam.Values()
-    for k, pose in enumerate(poses):
-        values.insert(X(k), pose)
-    return values
-
-
 def write_g2o(path: Path, solution: DriveSolution) -> None:
     """Write localised key poses as vertices and odometry as edges.
 
     The format knows no magnetic readings, no prior, no scale and no drift: lengths are corrected as
     they came out. Numbers have six digits, as GTSAM writes them.
     """
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph = gtsam.NonlinearFactorGraph()
     drive = solution.drive.without_drift(solution.steady, solution.poses)
     for number in range(len(drive.steps)):
         graph.add(step_factor(drive, number, solution.scale_error))
-    for k, pose in enumerate(solution.poses):
-        values.insert(X(k), pose)
-    gtsam.writeG2o(graph, values, str(path))
+    gtsam.writeG2o(graph, pose_values(solution.poses), str(path))

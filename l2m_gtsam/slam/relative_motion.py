@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import KeyPoseReadings, StepError, Whitening, rotation_matrices
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.geometry import carried_back
-from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.drive import Drive, stacked
 from l2m_gtsam.slam.map_prediction import MapPrediction
 from l2m_gtsam.slam.odometry import OdometrySteps
 from l2m_gtsam.solve.linear_algebra import covariance_root
@@ -162,9 +162,7 @@ def interpolated_readings(
     """Return n readings of a drive relative to their key poses, at estimates of their steps."""
     if not len(rows):
         return drive.readings[rows]
-    R = np.stack([each.rotation().matrix() for each in steps])
-    p = np.stack([each.translation() for each in steps])
-    readings = drive.readings[rows]
+    readings, (R, p) = drive.readings[rows], stacked(steps)
     R_odo, p_odo = drive.steps.R[readings.key_pose], drive.steps.p[readings.key_pose]
     turn = Rotation.from_matrix(R_odo.transpose(0, 2, 1) @ R).as_rotvec()
     return shifted_readings(readings, R_odo, p_odo, turn, p - p_odo)

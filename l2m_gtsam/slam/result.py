@@ -19,7 +19,7 @@ from l2m_gtsam.records.localisation import (
     SensorUse,
 )
 from l2m_gtsam.slam.disturbances import slip_notes
-from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.misfit import fits_decoy_as_well
 from l2m_gtsam.slam.pose_graph import PoseGraph
 from l2m_gtsam.slam.solution import DriveSolution
@@ -192,10 +192,4 @@ def _use(solution: DriveSolution, sensor: int) -> SensorUse:
 
 
 def _trajectory(drive: Drive, poses: list[gtsam.Pose3]) -> Trajectory:
-    return Trajectory(
-        stamp_ns=drive.stamp_ns,
-        R=np.stack([pose.rotation().matrix() for pose in poses]),
-        p=np.stack([pose.translation() for pose in poses]),
-        frame="map",
-        child_frame="lidar",
-    )
+    return Trajectory(drive.stamp_ns, *stacked(poses), frame="map", child_frame="lidar")

@@ -16,7 +16,7 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, ReadingFits, changed
-from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.map_prediction import (
     SharedMapErrors,
     errors_of,
@@ -89,7 +89,7 @@ class SmoothingProblem:
     def predict(self, values: gtsam.Values) -> DrivePrediction:
         """Query the map at the readings' places by these values."""
         sensors, poses = self.sensors(values), poses_in(values, len(self._drive))
-        motions = RelativeMotions.along(self._drive, list(poses.values()))
+        motions = RelativeMotions.along(self._drive, poses)
         return DrivePrediction(
             motions, predict(self._map, place_readings(motions.readings, poses, sensors), sensors)
         )
@@ -124,7 +124,7 @@ class SmoothingProblem:
     def fit(self, solved: SmoothingRound, counts: BoolArray) -> ReadingFits:
         """Return the residuals of the readings that may count."""
         predicted, readings = self.predict(solved.values), self._drive.readings
-        poses = poses_in(solved.values, len(self._drive)).values()
+        _, p = stacked(poses_in(solved.values, len(self._drive)))
         used = solved.weights > REJECTED_WEIGHT
         return ReadingFits(
             readings.key_pose,
@@ -132,7 +132,7 @@ class SmoothingProblem:
             predicted.prediction.inside & counts,
             used,
             predicted.independent(self.sensors(solved.values).noise, used),
-            np.stack([pose.translation() for pose in poses]),
+            p,
         )
 
     def graph(
@@ -196,7 +196,7 @@ class SmoothingProblem:
         predicted = self.predict(values)
         return DriveSolution(
             drive=replace(self._drive, sensors=sensors),
-            poses=list(poses_in(values, len(self._drive)).values()),
+            poses=poses_in(values, len(self._drive)),
             pose_covariance=pose_covariances(marginals, len(self._drive)),
             calibration_covariance=sensor_covariances(marginals, values, sensors),
             prediction=predicted.prediction,

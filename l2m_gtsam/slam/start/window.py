@@ -6,7 +6,7 @@ import numpy as np
 
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.key_pose_readings import evenly_spread
 
 AXES = 3
@@ -151,9 +151,7 @@ def window_of(drive: Drive, path_m: float, most: int) -> DriveWindow:
     most
         Limit of readings.
     """
-    poses = drive.dead_reckoning()
-    p = np.stack([pose.translation() for pose in poses])
-    R = np.stack([pose.rotation().matrix() for pose in poses])
+    R, p = stacked(drive.dead_reckoning())
     path = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1)))
     count = max(int(np.searchsorted(path, path_m, side="right")), min(2, len(path)))
     own = drive.readings[np.flatnonzero(drive.readings.key_pose < count)]

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 
 from l2m_factors import D, T, X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_pose
+from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_pose, stacked
 from l2m_gtsam.slam.joint_gaussian import JointGaussian
 from l2m_gtsam.slam.map_prediction import sensors_in
 from l2m_gtsam.slam.online.belief import POSE, Belief
@@ -103,6 +103,5 @@ def tile_of(pose: gtsam.Pose3, anchors: list[gtsam.Pose3], core: float) -> int:
     """Return the number of the tile that contains a pose; the next number if none does."""
     if not anchors:
         return 0
-    axes = level_axes(np.stack([anchor.rotation().matrix() for anchor in anchors]))
-    places = np.stack([anchor.translation() for anchor in anchors])
-    return tile_about(pose.translation(), axes, places, core)
+    R, places = stacked(anchors)
+    return tile_about(pose.translation(), level_axes(R), places, core)

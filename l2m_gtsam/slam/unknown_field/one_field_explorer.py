@@ -23,7 +23,7 @@ import gtsam
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
+from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose, stacked
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
 from l2m_gtsam.slam.options import SlamOptions
@@ -182,8 +182,7 @@ class OneFieldExplorer:
         if self._now is None:
             return np.empty((0, 3)), np.empty((0, 3))
         best, R = self._now.hypotheses.best, self._origin.rotation().matrix()
-        points = np.stack([each.translation() for each in best.poses])
-        axes = np.stack([each.rotation().matrix() for each in best.poses])
+        axes, points = stacked(best.poses)
         field = self._now.prior.field.field_and_gradient(points, best.state.weights)[0]
         # As a sensor with the given calibration has it, whose readings its readers know.
         found, given = best.state.distortion[0], self._sensors.distortion[0]

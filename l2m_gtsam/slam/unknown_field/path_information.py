@@ -13,7 +13,7 @@ G. Stadler, SIAM Journal on Scientific Computing 35, 2013). Where the estimate i
 some l are negative: readings hold the path nowhere along these directions, which stay, too.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -24,7 +24,7 @@ from scipy.sparse.linalg import splu
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.geometry import carried_back
-from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.drive import Drive, stacked
 from l2m_gtsam.slam.marginals import Marginals, pose_covariances
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.pose_graph import odometry_graph
@@ -227,9 +227,3 @@ def path_readings(
     at = tuple(np.broadcast_to(each, blocks.shape).ravel() for each in (row, column))
     shape = POSE * len(key), POSE * len(poses)
     return PathReadings(R, p, readings.field), csr_array((blocks.ravel(), at), shape=shape)
-
-
-def stacked(poses: Sequence[gtsam.Pose3]) -> tuple[FloatArray, FloatArray]:
-    """Return rotations (K, 3, 3) and positions (K, 3) in metres."""
-    R = np.stack([pose.rotation().matrix() for pose in poses])
-    return R, np.stack([pose.translation() for pose in poses])

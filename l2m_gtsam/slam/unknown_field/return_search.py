@@ -211,7 +211,7 @@ class Bending:
         bent.add(gtsam.JacobianFactor(X(self._last), self._by_pose, node, exact))
         delta = bent.optimize(self._ordering)
         poses = poses_in(self._values.retract(delta), self._last + 1)
-        return list(poses.values()), self._linear.error(delta) - self._least
+        return poses, self._linear.error(delta) - self._least
 
     @cached_property
     def _least(self) -> float:

@@ -152,8 +152,7 @@ class RevisitedTiles:
     def _read(self, rows: IntArray, sources: FoundSources) -> FloatArray:
         """Return what n readings read of sources in the map, uT, shape (n, 3)."""
         readings = self.motions.readings[rows]
-        own = {int(k): self.poses[int(k)] for k in np.unique(readings.key_pose)}
-        where = place_readings(readings, own, self.sensors)
+        where = place_readings(readings, self.poses, self.sensors)
         b_lidar = np.einsum("nji,nj->ni", where.readings.R_map_lidar, sources.field(where.x))
         return np.asarray(np.einsum("nij,nj->ni", where.C, b_lidar))
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from l2m_factors import D, M, V
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.drive import Drive, KnownSensors, as_pose
+from l2m_gtsam.slam.drive import Drive, KnownSensors, as_pose, stacked
 from l2m_gtsam.slam.odometry import FixedStep
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, WholeFieldOptions
@@ -267,7 +267,7 @@ def solved_stage(
 ) -> SolvedStage:
     """Solve a stage in so many rounds from initial poses and sensors."""
     for _ in range(rounds):
-        before = np.stack([pose.translation() for pose in poses])
+        _, before = stacked(poses)
         solved = problem.solved(poses, sensors, 1.0, CONVEX)
         poses, sensors = solved.poses, solved.sensors
     return SolvedStage(solved, before)

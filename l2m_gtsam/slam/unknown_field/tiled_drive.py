@@ -12,12 +12,13 @@ from l2m_factors import (
     KeyPoseReadings,
     M,
     TileBatch,
+    WeightedField,
     effective_parameters,
     joint_residual,
     tile_residual,
 )
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray, chosen_rows, joined
-from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.drive import KnownSensors, stacked
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, predict
 from l2m_gtsam.slam.pose_graph import successive
 from l2m_gtsam.slam.relative_motion import RelativeMotions
@@ -76,27 +77,23 @@ class OccupiedTile:
         return predict(FieldWithWeights(self.field, weights), self.placed, sensors)
 
 
-class FieldWithWeights:
+class FieldWithWeights(WeightedField):
     """A field with known weights, as a map in the frame of its anchor."""
 
     def __init__(self, tile: LinearField, weights: FloatArray) -> None:
-        self._tile, self._weights = tile, weights
-
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
-        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
-        return self._tile.field_and_gradient(points, self._weights)
+        super().__init__(tile, weights)
+        self._unresolved = tile.unresolved
 
     def query(self, points: FloatArray) -> FieldSample:
-        """Return the same with the variance of what the weights do not hold."""
+        """Return the field with the variance of what the weights do not hold."""
         field, gradient = self.field_and_gradient(points)
         inside = np.ones(len(points), bool)
-        return FieldSample(field, gradient, self._tile.unresolved(points), inside)
+        return FieldSample(field, gradient, self._unresolved(points), inside)
 
 
 def anchored(poses: list[gtsam.Pose3], prior: FieldPrior) -> tuple[Anchoring, FloatArray]:
     """Return the tiles of K key poses, and their level axes in the map, shape (K, 3, 3)."""
-    R = np.stack([pose.rotation().matrix() for pose in poses])
-    p = np.stack([pose.translation() for pose in poses])
+    R, p = stacked(poses)
     return anchor_tiles(R, p, prior.options.core), level_axes(R)
 
 

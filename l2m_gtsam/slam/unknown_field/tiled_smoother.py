@@ -170,7 +170,7 @@ class TiledProblem:
         order = self._ordering(graph, values)
         limit, close = self._options.max_iterations, self._close
         end = levenberg_marquardt(graph, values, order, limit, close)
-        found = list(poses_in(end.values, len(poses)).values())
+        found = poses_in(end.values, len(poses))
         after = sensors_in(end.values, sensors)
         return TiledRound(tiled, graph, weights, end.values, found, after, end.ending)
 
@@ -208,7 +208,7 @@ def in_map(
     predicted: DrivePrediction, tiled: TiledDrive, poses: list[gtsam.Pose3], sensors: KnownSensors
 ) -> MapPrediction:
     """Return the tiles' predictions with positions and axes of the map."""
-    placed = place_readings(predicted.motions.readings, dict(enumerate(poses)), sensors)
+    placed = place_readings(predicted.motions.readings, poses, sensors)
     variance = np.empty_like(predicted.prediction.map_variance)
     for tile in tiled.tiles:
         R = poses[tile.anchor].rotation().matrix()

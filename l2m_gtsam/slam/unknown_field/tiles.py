@@ -103,9 +103,7 @@ def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) ->
     path = drive.steps.path
     early = np.flatnonzero(path[drive.readings.key_pose] <= options.learn_over_m)
     readings = drive.readings[early]
-    where = place_readings(
-        readings, {int(k): poses[int(k)] for k in np.unique(readings.key_pose)}, drive.sensors
-    )
+    where = place_readings(readings, poses, drive.sensors)
     return field_prior(where.x, where.field(drive.sensors), options)
 
 

@@ -225,7 +225,7 @@ def full_prior(
 
 def placed(drive: Drive, poses: list[gtsam.Pose3]) -> PlacedReadings:
     """Return a drive's readings in the frame of its first key pose."""
-    relative = {k: poses[0].between(pose) for k, pose in enumerate(poses)}
+    relative = [poses[0].between(pose) for pose in poses]
     return place_readings(drive.readings, relative, drive.sensors)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.map_prediction import PlacedReadings, poses_in
 from l2m_gtsam.slam.marginals import Marginals, pose_covariances
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
@@ -116,7 +116,7 @@ def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> F
     solution = found.solution
     if options.calibration is not CalibrationUse.REFINED:
         solution = as_calibrated(solution, drive.sensors)
-    p = np.stack([pose.translation() for pose in solution.poses])
+    _, p = stacked(solution.poses)
     near = learnt.spectrum.prior.length
     return replace(found, solution=solution, gain=gain, returns=returned(p, drive.steps.path, near))
 
@@ -160,7 +160,7 @@ def as_calibrated(solution: DriveSolution, sensors: KnownSensors) -> DriveSoluti
 
 def is_settled(stage: SolvedStage, solution: DriveSolution) -> bool:
     """Return whether the last round moved the poses by no more than their sigmas."""
-    after = np.stack([pose.translation() for pose in solution.poses])
+    _, after = stacked(solution.poses)
     variance = np.trace(solution.pose_covariance[:, 3:, 3:], axis1=1, axis2=2)
     moved = np.sum((after - stage.before) ** 2, axis=1)
     return bool(moved.mean() <= SETTLED**2 * variance.mean())
@@ -230,7 +230,7 @@ def at_odometry(drive: Drive, prior: WholePrior, options: SlamOptions) -> FieldS
     solution = replace(
         found.solution,
         drive=replace(drive, sensors=found.solution.drive.sensors),
-        poses=list(poses_in(values, len(drive)).values()),
+        poses=poses_in(values, len(drive)),
         pose_covariance=pose_covariances(marginals, len(drive)),
         odometry_chi2=0.0,
         ending=Ending.TOLERANCE,

@@ -39,7 +39,7 @@ def closed_by_exact_loops(drive: Drive, truth: Trajectory, within_m: float) -> l
     graph, initial = drive_graph(linked), drive_values(linked, drive.dead_reckoning())
     order = colamd_ordering(graph)
     found = levenberg_marquardt(graph, initial, order, ITERATIONS, TOLERANCE)
-    return list(poses_in(found.values, len(drive)).values())
+    return poses_in(found.values, len(drive))
 
 
 def exact_loops(drive: Drive, truth: Trajectory, within_m: float) -> Links:

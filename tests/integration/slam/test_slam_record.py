@@ -50,7 +50,7 @@ def test_odometry_is_as_sure_as_its_graph() -> None:
         values.insert(X(k), pose)
     marginals = gtsam.Marginals(odometry_graph(drive), values)
     found, R = odometry_covariance(drive), localised().result.odometry.R
-    for k, pose in poses_in(values, len(drive)).items():
+    for k, pose in enumerate(poses_in(values, len(drive))):
         np.testing.assert_allclose(
             found[k], marginals.marginalCovariance(X(k)), rtol=1e-6, atol=1e-12
         )
