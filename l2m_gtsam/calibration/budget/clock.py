@@ -5,13 +5,13 @@ in three minutes. The offset of the middle of a drive is a variable of the graph
 random walk about it, of which a steady drift is the slowest modes.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from l2m_factors import PoseMotion, field_rate
-from l2m_gtsam.calibration.budget.processes import ReadingPlaces, TimeModes, times_modes
+from l2m_gtsam.calibration.budget.processes import Process, TimeModes, times_modes
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import DisturbanceKind
 
@@ -19,13 +19,12 @@ CLOCK_MODES = 8  # slower ones hold all but a thousandth of a steady drift's var
 
 
 @dataclass(frozen=True)
-class ClockDrift:
+class ClockDrift(Process):
     """The clock of a sensor walks against that of the poses."""
 
-    places: ReadingPlaces
     sensor: int
     modes: TimeModes
-    kind: DisturbanceKind = DisturbanceKind.CLOCK
+    kind = DisturbanceKind.CLOCK
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
@@ -42,10 +41,6 @@ class ClockDrift:
         slope = places.slope[rows] @ readings.R_map_lidar[rows]
         rate = field_rate(places.b_lidar[rows], slope, places.t[rows], motion)
         return times_modes(rate[:, :, None], self.modes.values(readings, rows))
-
-    def on(self, places: ReadingPlaces) -> "ClockDrift":
-        """Return the same modes in other readings."""
-        return replace(self, places=places)
 
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return how far the clock walks."""

@@ -6,12 +6,12 @@ weights along the axes of the sensor. They are in units of their standard deviat
 H is that of a vehicle that stands, its wheels straight.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from l2m_gtsam.calibration.budget.processes import ReadingPlaces, times_modes
+from l2m_gtsam.calibration.budget.processes import Process, times_modes
 from l2m_gtsam.data import FloatArray, IntArray, LidarMotion, Readings
 from l2m_gtsam.records.error_budget import DisturbanceKind
 from l2m_gtsam.solve.linear_algebra import right_divided
@@ -65,13 +65,12 @@ def motion_numbers(R_map_lidar: FloatArray, motion: LidarMotion) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class MovingParts:
+class MovingParts(Process):
     """H of a sensor follows the vehicle's motion."""
 
-    places: ReadingPlaces
     sensor: int
     motion: MotionUnits
-    kind: DisturbanceKind = DisturbanceKind.MOVING_PARTS
+    kind = DisturbanceKind.MOVING_PARTS
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
@@ -82,10 +81,6 @@ class MovingParts:
         """Return what adds to the readings along their axes, shape (n, 3, 12)."""
         along = right_divided(np.eye(3), self.places.C[rows])
         return times_modes(along, self.motion.values(self.places.readings, rows))
-
-    def on(self, places: ReadingPlaces) -> "MovingParts":
-        """Return the same in other readings."""
-        return replace(self, places=places)
 
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return what follows each, uT."""

@@ -9,9 +9,10 @@ the spectrum of a field that is smooth over a length (Solin and Sarkka, Statisti
 2020).
 """
 
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -108,29 +109,40 @@ def field_bend(
     return np.asarray(np.nan_to_num(bend / BEND_S**2))
 
 
-class Process(Protocol):
-    """A process by its modes."""
+@dataclass(frozen=True)
+class Process(ABC):
+    """A process by its modes.
+
+    Attributes
+    ----------
+    places
+        Readings that it may be in.
+    sensor
+        Whose they are; all if none is named.
+    kind
+        What it is.
+    """
+
+    places: ReadingPlaces
+    sensor: int | None
+    kind: ClassVar[DisturbanceKind]
 
     @property
-    def kind(self) -> DisturbanceKind:
-        """What it is."""
-
-    @property
-    def sensor(self) -> int | None:
-        """Whose readings it is in; all if none is named."""
-
-    @property
+    @abstractmethod
     def forms(self) -> tuple[FloatArray, ...]:
         """Alternatives: each the variances of m weights by K parts of a unit size, shape (K, m)."""
 
-    def features(self, rows: IntArray, /) -> FloatArray:
+    @abstractmethod
+    def features(self, rows: IntArray) -> FloatArray:
         """Return what weights do to the field in uT, lidar frame, shape (n, 3, m)."""
 
-    def on(self, places: ReadingPlaces, /) -> "Process":
-        """Return the same modes, weight by weight, in other readings."""
-
-    def named(self, form: int, sizes: FloatArray, /) -> dict[str, float]:
+    @abstractmethod
+    def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return the standard deviations of a form by name and unit, for variances of its parts."""
+
+    def on(self, places: ReadingPlaces) -> Self:
+        """Return the same modes, weight by weight, in other readings."""
+        return replace(self, places=places)
 
 
 @dataclass(frozen=True)
@@ -214,13 +226,12 @@ def times_modes(features: FloatArray, modes: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Wander:
+class Wander(Process):
     """H of a sensor wanders: 1/f noise, a random walk, or both."""
 
-    places: ReadingPlaces
     sensor: int
     modes: TimeModes
-    kind: DisturbanceKind = DisturbanceKind.WANDER
+    kind = DisturbanceKind.WANDER
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
@@ -232,23 +243,18 @@ class Wander:
         along = right_divided(np.eye(3), self.places.C[rows])
         return times_modes(along, self.modes.values(self.places.readings, rows))
 
-    def on(self, places: ReadingPlaces) -> "Wander":
-        """Return the same modes in other readings."""
-        return replace(self, places=places)
-
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return noise and walk, uT."""
         return named_noise_and_walk(self.modes, sizes)
 
 
 @dataclass(frozen=True)
-class PoseProcess:
+class PoseProcess(Process):
     """Errors of poses that last: tilt, heading, place on the floor and height have a size each."""
 
-    places: ReadingPlaces
     modes: TimeModes
-    kind: DisturbanceKind = DisturbanceKind.POSES
-    sensor: int | None = None
+    sensor: int | None = field(default=None, kw_only=True)
+    kind = DisturbanceKind.POSES
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
@@ -263,10 +269,6 @@ class PoseProcess:
         F = pose_features(unit, places.b_lidar[rows], slope, places.t[rows])
         return times_modes(F, self.modes.values(places.readings, rows))
 
-    def on(self, places: ReadingPlaces) -> "PoseProcess":
-        """Return the same modes in other readings."""
-        return replace(self, places=places)
-
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return what each part is wrong by, and how long it lasts."""
         tilt, heading, floor, height = np.sqrt(sizes).tolist()
@@ -280,13 +282,12 @@ class PoseProcess:
 
 
 @dataclass(frozen=True)
-class FieldProcess:
+class FieldProcess(Process):
     """The field is not the map's for a time: it changed, or the map misses what is on the way."""
 
-    places: ReadingPlaces
     modes: TimeModes
-    kind: DisturbanceKind = DisturbanceKind.FIELD
-    sensor: int | None = None
+    sensor: int | None = field(default=None, kw_only=True)
+    kind = DisturbanceKind.FIELD
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
@@ -298,10 +299,6 @@ class FieldProcess:
         readings = self.places.readings
         R_lidar_map = readings.R_map_lidar[rows].transpose(0, 2, 1)
         return times_modes(R_lidar_map, self.modes.values(readings, rows))
-
-    def on(self, places: ReadingPlaces) -> "FieldProcess":
-        """Return the same modes in other readings."""
-        return replace(self, places=places)
 
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return noise and walk, uT."""
@@ -359,7 +356,7 @@ class FloorModes:
 
 
 @dataclass(frozen=True)
-class Warp:
+class Warp(Process):
     """The drive's frame is bent against the map's, in the plane of the floor.
 
     Poses on a bent frame are shifted, and turned with it: by half the curl of the shifts.
@@ -367,11 +364,10 @@ class Warp:
     of ``WARP_M``, shape (2, J).
     """
 
-    places: ReadingPlaces
     modes: FloorModes
     spectra: FloatArray
-    kind: DisturbanceKind = DisturbanceKind.WARP
-    sensor: int | None = None
+    sensor: int | None = field(default=None, kw_only=True)
+    kind = DisturbanceKind.WARP
 
     @classmethod
     def of(cls, places: ReadingPlaces) -> "Warp":
@@ -398,10 +394,6 @@ class Warp:
         curl = self.modes.slopes(p)[:, :, ::-1] * [-1.0, 1.0]  # of a shift along x, and along y
         by_turn = np.einsum("ni,nja->nija", turn, 0.5 * curl).reshape(len(rows), 3, -1)
         return np.asarray(times_modes(slope[:, :, :2], self.modes.values(p)) + by_turn)
-
-    def on(self, places: ReadingPlaces) -> "Warp":
-        """Return the same modes in other readings."""
-        return replace(self, places=places)
 
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return the shift of both lengths together."""

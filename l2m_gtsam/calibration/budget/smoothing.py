@@ -10,11 +10,11 @@ of first order with a time constant of T has a mean of T and a variance of T^2, 
 has W / 2 and W^2 / 12.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.calibration.budget.processes import ReadingPlaces
+from l2m_gtsam.calibration.budget.processes import Process
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import DisturbanceKind
 
@@ -22,12 +22,11 @@ LAGGING_S = 0.015  # a filter that delays by less smooths by less, which does no
 
 
 @dataclass(frozen=True)
-class Smoothing:
+class Smoothing(Process):
     """Readings of a sensor are means over some time."""
 
-    places: ReadingPlaces
     sensor: int
-    kind: DisturbanceKind = DisturbanceKind.SMOOTHING
+    kind = DisturbanceKind.SMOOTHING
 
     @property
     def forms(self) -> tuple[FloatArray, ...]:
@@ -39,10 +38,6 @@ class Smoothing:
         if self.places.bend is None:
             return np.zeros((len(rows), 3, 1))
         return np.asarray(0.5 * self.places.bend[rows, :, None])
-
-    def on(self, places: ReadingPlaces) -> "Smoothing":
-        """Return the same in other readings."""
-        return replace(self, places=places)
 
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return over how long readings are means: the standard deviation of the time."""
