@@ -6,7 +6,7 @@ then what can be known: C and H there, and what the rank test finds of t.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -88,12 +88,4 @@ def by_least_squares(options: OneKeyOptions) -> OneKeyOptions:
 def without(view: View, sensors: Collection[int]) -> View:
     """Return a view without the readings of some sensors; what lies inside the map stays."""
     keep = ~np.isin(view.readings.sensor, list(sensors))
-    return replace(
-        view,
-        readings=view.readings.select(keep),
-        b_lidar=view.b_lidar[keep],
-        map_variance=view.map_variance[keep],
-        trust=view.trust[keep],
-        rows=view.rows[keep],
-        sensors=[each for each in view.sensors if each not in sensors],
-    )
+    return view.select(keep, [each for each in view.sensors if each not in sensors])

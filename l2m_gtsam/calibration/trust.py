@@ -180,15 +180,7 @@ def counting(view: View, weights: FloatArray, min_readings: int, *, final: bool)
     count = np.bincount(sensor[weights > NOTHING], minlength=len(view.readings.sensors))
     keep = (weights > NOTHING) & (count >= min_readings)[sensor]
     sensors = [s for s in view.sensors if count[s] >= min_readings]
-    kept = replace(
-        view,
-        readings=view.readings.select(keep),
-        b_lidar=view.b_lidar[keep],
-        map_variance=view.map_variance[keep],
-        trust=weights[keep],
-        rows=view.rows[keep],
-        sensors=sensors,
-    )
+    kept = replace(view, trust=weights).select(keep, sensors)
     return Trusted(kept, sensor, weights, final)
 
 

@@ -76,6 +76,18 @@ class View:
     inside: BoolArray
     sensors: list[int]
 
+    def select(self, keep: BoolArray, sensors: list[int]) -> "View":
+        """Return the part of the readings where ``keep``, shape (N,), is true, of some sensors."""
+        return replace(
+            self,
+            readings=self.readings.select(keep),
+            b_lidar=self.b_lidar[keep],
+            map_variance=self.map_variance[keep],
+            trust=self.trust[keep],
+            rows=self.rows[keep],
+            sensors=sensors,
+        )
+
 
 def places_of(readings: Readings, t: FloatArray) -> FloatArray:
     """Return where readings were taken in the map, metres, shape (N, 3).
