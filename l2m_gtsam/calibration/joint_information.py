@@ -14,7 +14,7 @@ Columns are scaled to unit information: sigmas of metres, microtesla and seconds
 and Cholesky factors what GTSAM's test of neighbouring pivots refuses; QR does the rest.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -369,7 +369,13 @@ def root_by_qr(rows: Sequence[Rows], weights: FloatArray, scale: FloatArray) -> 
     return np.asfortranarray((root * np.sign(np.diag(root))[:, None]).T)
 
 
-def columns_at(columns: Mapping[int, slice], keys: Sequence[int]) -> IntArray:
+def slices_of(sizes: Mapping[int, int]) -> dict[int, slice]:
+    """Return where each variable stands, one after the other, by their sizes."""
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {key: slice(end - sizes[key], end) for key, end in zip(sizes, ends, strict=True)}
+
+
+def columns_at(columns: Mapping[int, slice], keys: Iterable[int]) -> IntArray:
     """Return where the variables of some keys stand, in their order."""
     at = [np.arange(columns[key].start, columns[key].stop) for key in keys]
     return np.concatenate([NO_READINGS, *at])

@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from l2m_gtsam.calibration.joint_information import columns_at, slices_of
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.solve.linear_algebra import correlation_factor, triangular_information_root
 
@@ -100,7 +101,7 @@ class JointGaussian:
 
     def columns(self, keys: Iterable[int]) -> IntArray:
         """Return the components of some variables, one after the other."""
-        return columns_of(self.slices, keys)
+        return columns_at(self.slices, keys)
 
     def marginal(self, keys: Sequence[int]) -> "JointGaussian":
         """Return the marginal of some variables, in this order."""
@@ -133,18 +134,6 @@ class JointGaussian:
         values.insert(after.values)
         covariance = np.block([[left, across], [across.T, after.covariance]])
         return JointGaussian(values, {**rest, **after.sizes}, covariance)
-
-
-def slices_of(sizes: Mapping[int, int]) -> dict[int, slice]:
-    """Return each variable's components in a stacked vector."""
-    ends = np.cumsum(list(sizes.values())).tolist()
-    return {key: slice(end - sizes[key], end) for key, end in zip(sizes, ends, strict=True)}
-
-
-def columns_of(slices: Mapping[int, slice], keys: Iterable[int]) -> IntArray:
-    """Return the components of some variables, one after the other."""
-    own = [np.arange(slices[key].start, slices[key].stop) for key in keys]
-    return np.concatenate(own) if own else np.empty(0, dtype=np.int64)
 
 
 def part_of(values: gtsam.Values, keys: Sequence[int]) -> gtsam.Values:

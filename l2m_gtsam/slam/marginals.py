@@ -11,12 +11,12 @@ import numpy as np
 from scipy.linalg.lapack import dtrtri
 
 from l2m_factors import D, G, T, X
+from l2m_gtsam.calibration.joint_information import columns_at, slices_of
 from l2m_gtsam.calibration.optimise import refused
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.slam.drive import Drive, KnownSensors
-from l2m_gtsam.slam.joint_gaussian import columns_of, slices_of
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.solve.linear_algebra import triangular_information_root
 
@@ -213,7 +213,7 @@ def net_covariance(net: gtsam.GaussianBayesNet, keys: Sequence[int]) -> FloatArr
     """
     parts = [net.at(row) for row in range(net.size())]
     slices = slices_of({each.firstFrontalKey(): len(each.R()) for each in parts})
-    at = columns_of(slices, keys)
+    at = columns_at(slices, keys)
     return covariance_of(net.matrix()[0])[np.ix_(at, at)]
 
 

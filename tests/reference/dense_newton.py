@@ -5,14 +5,13 @@ from collections.abc import Mapping
 import gtsam
 import numpy as np
 
+from l2m_gtsam.calibration.joint_information import columns_at, slices_of
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.joint_gaussian import (
     JointGaussian,
-    columns_of,
     local,
     poses_among,
     retracted,
-    slices_of,
 )
 from l2m_gtsam.slam.marginals import ordered
 
@@ -29,7 +28,7 @@ def newton(
     """Return where a graph and a prior have their least cost, and the covariance there."""
     count, at = sum(sizes.values()), slices_of(sizes)
     among = [key for key in sizes if graph.keys().count(key)]
-    own, prior = columns_of(at, among), columns_of(at, known.sizes)
+    own, prior = columns_at(at, among), columns_at(at, known.sizes)
     for _ in range(steps):
         H, descent = np.zeros((count, count)), np.zeros(count)
         H[np.ix_(own, own)], descent[own] = graph.linearize(values).hessian(ordered(among))
