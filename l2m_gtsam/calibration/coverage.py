@@ -17,7 +17,8 @@ from scipy.linalg.lapack import dpotri, dtrtri
 
 from l2m_factors import M, P, Q, SharedError, U, map_weights_information, pose_errors_prior
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
-from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.factor_graph import Estimate, unit_priors
+from l2m_gtsam.calibration.joint_information import slices_of
 from l2m_gtsam.calibration.pose_errors import PoseKnots, pose_seconds
 from l2m_gtsam.calibration.view import View, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
@@ -70,14 +71,6 @@ class MovingFields:
         scaled = numbers * self.scales[sensor]
         features = np.einsum("nk,ij->nikj", scaled, np.eye(AXES))
         return (SharedError(Q(sensor), features.reshape(len(scaled), AXES, -1)),)
-
-    def prior(self) -> gtsam.NonlinearFactorGraph:
-        """Return the prior of all weights: zero mean, unit variance."""
-        graph = gtsam.NonlinearFactorGraph()
-        for key, size in self.sizes.items():
-            unit = gtsam.noiseModel.Unit.Create(size)
-            graph.add(gtsam.PriorFactorVector(key, np.zeros(size), unit))
-        return graph
 
     def correction(
         self, sensor: int, weights: FloatArray, covariance: FloatArray, C: FloatArray
@@ -292,21 +285,18 @@ class Coverage:
         """Number of weights of each key of the graph."""
         knots = 0 if self.knots is None else len(self.knots.seconds)
         tiles = {M(tile): size for tile, size in self.tiles.items()}
+        return tiles | {P(knot): POSE for knot in range(knots)} | self._unit_sizes
+
+    @property
+    def _unit_sizes(self) -> dict[int, int]:
+        """The same of those with unit variance beforehand, each alone."""
         suite = {U(): len(self.spread)} if len(self.spread) else {}
-        return (
-            tiles
-            | {P(knot): POSE for knot in range(knots)}
-            | suite
-            | self.moving.sizes
-            | self.budget.sizes
-        )
+        return suite | self.moving.sizes | self.budget.sizes
 
     @property
     def columns(self) -> dict[int, slice]:
         """Where the weights of each key stand among all of them."""
-        ends = np.cumsum(list(self.sizes.values())).tolist()
-        pairs = zip(self.sizes.items(), ends, strict=True)
-        return {key: slice(end - size, end) for (key, size), end in pairs}
+        return slices_of(self.sizes)
 
     def prior(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior of all weights, which is linear in them."""
@@ -320,11 +310,7 @@ class Coverage:
         graph = gtsam.NonlinearFactorGraph()
         if self.knots is not None:
             graph.push_back(pose_errors_prior(self.knots.correlation.tolist()))
-        if count := len(self.spread):
-            unit = gtsam.noiseModel.Unit.Create(count)
-            graph.add(gtsam.PriorFactorVector(U(), np.zeros(count), unit))
-        graph.push_back(self.moving.prior())
-        graph.push_back(self.budget.prior())
+        graph.push_back(unit_priors(self._unit_sizes))
         return graph
 
 

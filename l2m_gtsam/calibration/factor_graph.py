@@ -177,6 +177,15 @@ def prior_graph(estimate: Estimate, tests: Mapping[int, Determinacy]) -> gtsam.N
     return graph
 
 
+def unit_priors(sizes: Mapping[int, int]) -> gtsam.NonlinearFactorGraph:
+    """Return the priors of weights of zero mean and unit variance, by key and number."""
+    graph = gtsam.NonlinearFactorGraph()
+    for key, size in sizes.items():
+        unit = gtsam.noiseModel.Unit.Create(size)
+        graph.add(gtsam.PriorFactorVector(key, np.zeros(size), unit))
+    return graph
+
+
 def whitened_jacobian(
     batch: BatchedReadings, W: FloatArray, values: gtsam.Values, sensor: int
 ) -> FloatArray:

@@ -27,6 +27,7 @@ from l2m_factors import (
     joint_residual,
     scaled_step_factor,
 )
+from l2m_gtsam.calibration.factor_graph import unit_priors
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
 from l2m_gtsam.slam.links import MAP, Links
@@ -154,8 +155,7 @@ def odometry_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
         steps = [drifting_residual(drive, number, own) for number, own in enumerate(steady)]
         for first in range(0, len(steps), TOGETHER):
             graph.add(joint_residual(steps[first : first + TOGETHER]).factor())
-        unit = gtsam.noiseModel.Unit.Create(DRIFT)
-        graph.add(gtsam.PriorFactorVector(V(), np.zeros(DRIFT), unit))
+        graph.push_back(unit_priors({V(): DRIFT}))
         return graph
     one_step = scaled_factor if sigma else step_factor
     for number in range(len(drive.steps)):

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import gtsam
 import numpy as np
 
 from l2m_factors import A, B, F, K, L, SharedError, W
@@ -82,14 +81,6 @@ class Budget:
             for key, each in self.variables.items()
             if each.process.sensor in (None, sensor)
         )
-
-    def prior(self) -> gtsam.NonlinearFactorGraph:
-        """Return the prior of all weights: zero mean, unit variance."""
-        graph = gtsam.NonlinearFactorGraph()
-        for key, size in self.sizes.items():
-            unit = gtsam.noiseModel.Unit.Create(size)
-            graph.add(gtsam.PriorFactorVector(key, np.zeros(size), unit))
-        return graph
 
     def wander(self, sensor: int) -> FoundProcess | None:
         """Return how H of a sensor wanders, if it does."""

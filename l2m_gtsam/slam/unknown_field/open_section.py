@@ -11,6 +11,7 @@ from l2m_factors import (
     M,
     X,
 )
+from l2m_gtsam.calibration.factor_graph import unit_priors
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.joint_gaussian import (
@@ -287,9 +288,7 @@ class OpenSection:
     def _factors(self, counted: Sequence[TileReadings]) -> gtsam.NonlinearFactorGraph:
         """Return the factors of all but the memory."""
         graph, old = self._motions(), len(self._memory.tiles)
-        for tile in self._tiles[old:]:
-            unit = gtsam.noiseModel.Unit.Create(len(tile.field))
-            graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
+        graph.push_back(unit_priors({M(t.number): len(t.field) for t in self._tiles[old:]}))
         for each in counted:
             for factor in each.factors():
                 graph.add(factor)

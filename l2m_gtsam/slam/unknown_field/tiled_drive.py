@@ -17,6 +17,7 @@ from l2m_factors import (
     joint_residual,
     tile_residual,
 )
+from l2m_gtsam.calibration.factor_graph import unit_priors
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray, chosen_rows, joined
 from l2m_gtsam.slam.drive import KnownSensors, stacked
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, predict
@@ -240,8 +241,7 @@ class TiledDrive:
         graph, motions = gtsam.NonlinearFactorGraph(), motions.without(self.brought)
         for tile, penalty in zip(self.tiles, penalties, strict=True):
             rows = np.intersect1d(tile.rows, chosen)
-            unit = gtsam.noiseModel.Unit.Create(len(tile.field))
-            graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
+            graph.push_back(unit_priors({M(tile.number): len(tile.field)}))
             if len(rows):
                 readings = motions.readings[rows]
                 batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)

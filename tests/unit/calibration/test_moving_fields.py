@@ -6,6 +6,7 @@ import pytest
 
 from l2m_factors import Q, shared_error
 from l2m_gtsam.calibration.coverage import Correction, MovingFields, moving_fields
+from l2m_gtsam.calibration.factor_graph import unit_priors
 from l2m_gtsam.calibration.moving_solve import without
 from l2m_gtsam.data import FloatArray, Readings
 
@@ -58,7 +59,7 @@ def test_the_prior_is_of_unit_variance() -> None:
     moving = MovingFields({3: np.ones(2)})
     values = gtsam.Values()
     values.insert(Q(3), np.arange(6.0))
-    graph = moving.prior()
+    graph = unit_priors(moving.sizes)
     assert graph.size() == 1
     # GTSAM's error is half of the sum of squares.
     assert graph.error(values) == pytest.approx(0.5 * np.sum(np.arange(6.0) ** 2))
