@@ -54,11 +54,6 @@ class SurveyPoses:
     sizes: FloatArray | None = None
     duration_stated: bool = True
 
-    @property
-    def known(self) -> bool:
-        """Whether anything says how large the errors are."""
-        return self.stated or self.sizes is not None
-
     def sized(self, sizes: FloatArray, lasting_s: float) -> "SurveyPoses":
         """Return errors of these standard deviations in rad and m, shape (6,)."""
         return replace(self, sizes=sizes, lasting_s=lasting_s)

@@ -29,51 +29,18 @@ from scipy.linalg.lapack import dpstrf
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid
-from l2m_gtsam.maps.harmonic.basis import batches
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, Learnt
-from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tile import Tile, TileModes
 from l2m_gtsam.maps.harmonic.tile_correlation import joint_covariance
 from l2m_gtsam.maps.harmonic.tile_sums import tile_pull
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.solve.linear_algebra import covariance_root
 
 NEGLIGIBLE = 1e-11  # share of the variance at places
 LINEAR = 0.002  # metres over which a field that varies over decimetres is linear
 NOTICEABLE = 0.01  # of the noise, rms over a drive: what matters to ten thousand readings
-
-
-@dataclass(frozen=True)
-class TileModes:
-    """The error of one tile.
-
-    Attributes
-    ----------
-    tile
-        Tile with the posterior of its m weights.
-    weights
-        L U: the tile's weights for one unit of each beta, shape (m, r).
-    """
-
-    tile: Tile
-    weights: FloatArray
-
-    def __len__(self) -> int:
-        return int(self.weights.shape[1])
-
-    def features(self, points: FloatArray) -> FloatArray:
-        """Return A at points, uT per unit of beta, shape (N, 3, r)."""
-        A = np.empty((len(points), 3, len(self)))
-        for at in batches(len(points)):
-            A[at] = self.rows(points[at]).transpose(2, 1, 0)
-        return A
-
-    def rows(self, points: FloatArray) -> FloatArray:
-        """Return A at points beta by beta, uT per unit of beta, shape (r, 3, N)."""
-        tile = self.tile
-        F = tile.basis.rows(tile.within(points), np.ones(len(tile.basis)))
-        A = self.weights.T @ F.reshape(len(F), 3 * len(points))
-        return np.asarray(A.reshape(len(self), 3, len(points)))
 
 
 @dataclass(frozen=True)
@@ -204,7 +171,7 @@ def suite_modes(
     if learnt.suite is None or not tiles:
         return SuiteModes({}, np.empty((3, 0)), np.empty(0))
     suite, weight = learnt.suite, learnt.readings.weight
-    root = suite_root(suite)
+    root = covariance_root(suite.covariance)  # singular, where errors are known or the same
     shift = suite.mean_shift(weight)
 
     def moved(index: int) -> FloatArray:
@@ -224,13 +191,6 @@ def suite_modes(
     squares, turned = np.linalg.eigh(gram)
     least = 3 * len(points) * (NOTICEABLE * learnt.hyperparameters.noise) ** 2
     return every.among(turned[:, squares > least])
-
-
-def suite_root(suite: SuiteErrors) -> FloatArray:
-    """Return a root of the covariance of the sensors' errors, shape (16 S, 16 S)."""
-    # It may be singular, where errors are known or the same.
-    squares, turned = np.linalg.eigh(suite.covariance)
-    return np.asarray(turned * np.sqrt(np.maximum(squares, 0.0)))
 
 
 def moved_weights(

@@ -88,11 +88,6 @@ class Family(Protocol):
         """Return the field (N, 3) in uT and its gradient (N, 3, 3) in uT/m for given weights."""
 
 
-def no_slopes(variance: float, count: int) -> WeightPrior:
-    """Return a prior that depends on no hyperparameter."""
-    return WeightPrior(np.full(count, np.log(variance)), {})
-
-
 @dataclass(frozen=True)
 class UniformField:
     """The same field everywhere.
@@ -110,7 +105,7 @@ class UniformField:
 
     def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
         """Return the prior of the weights; see ``Family``."""
-        return no_slopes(self.sigma**2, 3)
+        return WeightPrior(np.full(3, np.log(self.sigma**2)), {})
 
     def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
         """Write the same for all points; see ``Family``."""

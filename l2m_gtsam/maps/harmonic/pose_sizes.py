@@ -20,7 +20,6 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import COARSE
-from l2m_gtsam.maps.harmonic.error_modes import suite_root
 from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
 from l2m_gtsam.maps.harmonic.learning import Window, maximise
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
@@ -29,6 +28,7 @@ from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.tiling import spread_tiles
 from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.solve.linear_algebra import covariance_root
 from l2m_gtsam.solve.variance_components import (
     VarianceComponents,
     WeightSystem,
@@ -224,7 +224,7 @@ def pose_view(learnt: Learnt, tiles: Tiles, poses: SurveyPoses, index: int) -> P
     errors[at] = effects.white
     by_unit = np.square(errors[at]).mean(axis=(0, 1))
     if learnt.suite is not None:  # those of the sensors explain what they can
-        root = suite_root(learnt.suite)
+        root = covariance_root(learnt.suite.covariance)
         errors = np.concatenate([errors, learnt.suite.of_field(rows, gradient) @ root], axis=2)
     root_weight = np.sqrt(readings.weight)[:, None, None] / tile.hyperparameters.noise
     E = (errors * root_weight).reshape(-1, errors.shape[2])

@@ -31,8 +31,9 @@ import numpy as np
 from scipy.linalg import null_space
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
-from l2m_gtsam.maps.harmonic.error_modes import TileModes, moved_weights
+from l2m_gtsam.maps.harmonic.error_modes import moved_weights
 from l2m_gtsam.maps.harmonic.learnt import Learnt
+from l2m_gtsam.maps.harmonic.tile import TileModes
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SIZE, SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads

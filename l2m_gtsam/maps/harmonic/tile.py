@@ -72,12 +72,8 @@ class Tile:
         low = np.array([0.0, 0.0, -NEAREST * h.floor_depth])
         return low, np.append(frame.size, frame.height + NEAREST * h.ceiling_depth)
 
-    def root(self, points: FloatArray) -> FloatArray:
-        """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""
-        return self.root_rows(points).transpose(2, 1, 0)
-
     def root_rows(self, points: FloatArray) -> FloatArray:
-        """Return ``F L`` weight by weight, shape (m, 3, N); see ``root``."""
+        """Return ``F L``, whose products are the map's covariance, by weights, uT, (m, 3, N)."""
         return self.weights.root_rows(self.basis, self.within(points))
 
     def unwhitened(self, directions: FloatArray) -> FloatArray:
@@ -125,3 +121,36 @@ class Tile:
         local = vertical[:, None] * np.array([0.5, 0.5, 1.0])
         # Diagonal of R diag(v) R^T; correlations between axes are left out.
         return np.asarray(local @ (self.basis.frame.R_map_tile.T**2))
+
+
+@dataclass(frozen=True)
+class TileModes:
+    """The error of one tile.
+
+    Attributes
+    ----------
+    tile
+        Tile with the posterior of its m weights.
+    weights
+        L U: the tile's weights for one unit of each beta, shape (m, r).
+    """
+
+    tile: Tile
+    weights: FloatArray
+
+    def __len__(self) -> int:
+        return int(self.weights.shape[1])
+
+    def features(self, points: FloatArray) -> FloatArray:
+        """Return A at points, uT per unit of beta, shape (N, 3, r)."""
+        A = np.empty((len(points), 3, len(self)))
+        for at in batches(len(points)):
+            A[at] = self.rows(points[at]).transpose(2, 1, 0)
+        return A
+
+    def rows(self, points: FloatArray) -> FloatArray:
+        """Return A at points beta by beta, uT per unit of beta, shape (r, 3, N)."""
+        tile = self.tile
+        F = tile.basis.rows(tile.within(points), np.ones(len(tile.basis)))
+        A = self.weights.T @ F.reshape(len(F), 3 * len(points))
+        return np.asarray(A.reshape(len(self), 3, len(points)))

@@ -4,7 +4,6 @@ Tiles share readings, and a pass that goes through several brings errors of its 
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.sparse import csr_array, tril
@@ -12,7 +11,7 @@ from scipy.sparse import csr_array, tril
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.evidence import SharedNoise
 from l2m_gtsam.maps.harmonic.learnt import Learnt
-from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tile import TileModes
 from l2m_gtsam.maps.survey_poses import ErrorKnots, SurveyPoses
 from l2m_gtsam.parallel.threads import in_threads
 
@@ -20,24 +19,7 @@ WHOLE = 1 - 1e-6  # of a variance: the survey's noise has no more of it
 APART = 6.0  # in durations: errors of poses so far apart have 0.25 % in common
 
 
-class TileErrors(Protocol):
-    """The error of one tile as r correlated numbers; see ``error_modes.TileModes``."""
-
-    @property
-    def tile(self) -> Tile:
-        """The tile."""
-
-    def __len__(self) -> int:
-        """Return how many."""
-
-    def features(self, points: FloatArray) -> FloatArray:
-        """Return what a unit of each does at points, uT, shape (N, 3, r)."""
-
-    def rows(self, points: FloatArray) -> FloatArray:
-        """Return the same number by number, shape (r, 3, N)."""
-
-
-def joint_covariance(learnt: Learnt, tiles: dict[int, TileErrors]) -> FloatArray:
+def joint_covariance(learnt: Learnt, tiles: dict[int, TileModes]) -> FloatArray:
     """Return the covariance of all beta: one in each tile, and what shared noise correlates."""
     indices = list(tiles)
     # What a step of the field lies between is left to each tile.
@@ -112,7 +94,7 @@ class SeenPoses:
         )
 
 
-def seen_noise(learnt: Learnt, modes: TileErrors, index: int, shared: IntArray) -> SeenNoise:
+def seen_noise(learnt: Learnt, modes: TileModes, index: int, shared: IntArray) -> SeenNoise:
     """Return what the survey's noise makes of a tile's beta; ``shared`` as ``SeenNoise.rows``."""
     readings, noise = learnt.readings, learnt.hyperparameters.noise
     if learnt.poses is None:
