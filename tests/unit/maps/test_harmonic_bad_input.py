@@ -7,17 +7,9 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.training import additional_set, training_set
-from tests.worlds.harmonic import OPTIONS, POST, fitted_map, queries, readings, refuse_large_windows
+from tests.worlds.harmonic import OPTIONS, POST, queries, readings
 
-
-@pytest.fixture(autouse=True)
-def affordable(monkeypatch: pytest.MonkeyPatch) -> None:
-    refuse_large_windows(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def harmonic() -> HarmonicMap:
-    return fitted_map()
+pytestmark = pytest.mark.usefixtures("affordable")
 
 
 def test_bad_queries_are_refused(harmonic: HarmonicMap) -> None:

@@ -12,12 +12,7 @@ from l2m_gtsam.maps.harmonic.evidence import normal_of
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions
 from l2m_gtsam.maps.harmonic.tile import Tile
-from tests.worlds.harmonic import PRIOR, fitted_map, queries, within_survey
-
-
-@pytest.fixture(scope="module")
-def harmonic() -> HarmonicMap:
-    return fitted_map()
+from tests.worlds.harmonic import PRIOR, queries, within_survey
 
 
 @pytest.fixture(scope="module")

@@ -18,23 +18,13 @@ from tests.worlds.harmonic import (
     PRIOR,
     WORLD,
     assert_same,
-    fitted_map,
     queries,
     readings,
-    refuse_large_windows,
     rms,
     within_survey,
 )
 
-
-@pytest.fixture(autouse=True)
-def affordable(monkeypatch: pytest.MonkeyPatch) -> None:
-    refuse_large_windows(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def harmonic() -> HarmonicMap:
-    return fitted_map()
+pytestmark = pytest.mark.usefixtures("affordable")
 
 
 def test_a_survey_of_dipoles_is_predicted_with_a_true_sigma() -> None:

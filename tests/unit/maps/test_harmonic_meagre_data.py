@@ -15,15 +15,11 @@ from tests.worlds.harmonic import (
     assert_same,
     queries,
     readings,
-    refuse_large_windows,
     rms,
     within_survey,
 )
 
-
-@pytest.fixture(autouse=True)
-def affordable(monkeypatch: pytest.MonkeyPatch) -> None:
-    refuse_large_windows(monkeypatch)
+pytestmark = pytest.mark.usefixtures("affordable")
 
 
 def scores(ours: HarmonicMap, world: DipoleWorld, at: FloatArray) -> FloatArray:

@@ -12,17 +12,9 @@ from l2m_gtsam.data import MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
-from tests.worlds.harmonic import assert_same, fitted_map, queries, readings, refuse_large_windows
+from tests.worlds.harmonic import assert_same, queries, readings
 
-
-@pytest.fixture(autouse=True)
-def affordable(monkeypatch: pytest.MonkeyPatch) -> None:
-    refuse_large_windows(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def harmonic() -> HarmonicMap:
-    return fitted_map()
+pytestmark = pytest.mark.usefixtures("affordable")
 
 
 def through_a_file(state: MapState) -> MapState:
