@@ -15,6 +15,7 @@ from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.sliding_gp import SlidingGP
 from tests.reference.potentials import features
+from tests.support.central_differences import slopes
 from tests.worlds.exact import DIPOLE_CONSTANT, DipoleWorld
 from tests.worlds.harmonic import OPTIONS, POST, PRIOR, WORLD, fitted_map, rms
 from tests.worlds.harmonic import readings as readings_at_a_post
@@ -72,12 +73,7 @@ def test_every_single_feature_has_no_divergence_and_no_curl(field_map: HarmonicM
 
 def differences(field_map: HarmonicMap, points: FloatArray, step: float = 1e-4) -> FloatArray:
     """Return the gradient by central differences, shape (N, 3, 3)."""
-    columns = []
-    for axis in np.eye(3):
-        up, _ = field_map.field_and_gradient(points + step * axis)
-        down, _ = field_map.field_and_gradient(points - step * axis)
-        columns.append((up - down) / (2 * step))
-    return np.stack(columns, axis=-1)
+    return slopes(lambda x: field_map.field_and_gradient(x)[0], points, step)
 
 
 def alone(field_map: HarmonicMap, points: FloatArray) -> FloatArray:

@@ -1,7 +1,5 @@
 """Families of harmonic functions and bases of them: derivatives, priors, what is left out."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -10,6 +8,7 @@ from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.family import Family
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, Modes, left_out, modes_up_to
 from tests.reference.potentials import features, potential, potential_of_basis
+from tests.support.central_differences import slopes
 from tests.worlds.harmonic import FAMILIES, GIVEN, SIZE, TILTED, basis, places
 
 EACH_FAMILY = pytest.mark.parametrize("name", list(FAMILIES))
@@ -17,13 +16,6 @@ EACH_FAMILY = pytest.mark.parametrize("name", list(FAMILIES))
 
 def weights_for(family: Family | Basis) -> FloatArray:
     return np.random.default_rng(2).normal(size=len(family))
-
-
-def slopes(of: Callable[[FloatArray], FloatArray], points: FloatArray, step: float) -> FloatArray:
-    """Derivatives along x, y and z by central differences, the axis last."""
-    return np.stack(
-        [(of(points + step * e) - of(points - step * e)) / (2 * step) for e in np.eye(3)], axis=-1
-    )
 
 
 def assert_derivative(analytic: FloatArray, numeric: FloatArray) -> None:
