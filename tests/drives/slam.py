@@ -45,17 +45,22 @@ class SlamDrive:
         return float(np.linalg.norm(np.diff(self.truth.p, axis=0), axis=1).sum())
 
 
+def ahead(at: FloatArray, p: FloatArray) -> Trajectory:
+    """Return a drive along a path, headed where it goes, with a little roll and pitch."""
+    v = np.asarray(np.gradient(p, at, axis=0))
+    turns = [np.arctan2(v[:, 1], v[:, 0]), 0.02 * np.sin(0.9 * at), 0.02 * np.cos(1.1 * at)]
+    R = Rotation.from_euler("ZYX", np.column_stack(turns)).as_matrix()
+    stamps = (1e9 * at).astype(np.int64) + 1_700_000_000_000_000_000
+    return Trajectory(stamps, R, p, "map", "lidar")
+
+
 def rounds(seconds: float, radius: float = 2.5) -> Trajectory:
     """Return laps of a rosette about the hall's middle, with a little roll, pitch and heave."""
     at = np.arange(0, seconds, 1 / RATE_HZ)
     angle = SPEED / radius * at
     r = radius * (1 + 0.25 * np.cos(2.3 * angle))
     p = np.column_stack([r * np.cos(angle), r * np.sin(angle), 0.5 + 0.03 * np.sin(1.3 * at)])
-    v = np.gradient(p, at, axis=0)
-    turns = [np.arctan2(v[:, 1], v[:, 0]), 0.02 * np.sin(0.9 * at), 0.02 * np.cos(1.1 * at)]
-    R = Rotation.from_euler("ZYX", np.column_stack(turns)).as_matrix()
-    stamps = (1e9 * at).astype(np.int64) + 1_700_000_000_000_000_000
-    return Trajectory(stamps, R, p, "map", "lidar")
+    return ahead(at, p)
 
 
 def laps(seconds: float, radii: tuple[float, float] = (4.0, 2.5)) -> Trajectory:
@@ -66,11 +71,7 @@ def laps(seconds: float, radii: tuple[float, float] = (4.0, 2.5)) -> Trajectory:
     deep = radii[1] + 0.15 * np.sin(1.71 * angle + 1.0)
     height = 0.5 + 0.03 * np.sin(1.3 * at)
     p = np.column_stack([wide * np.cos(angle), deep * np.sin(angle), height])
-    v = np.gradient(p, at, axis=0)
-    turns = [np.arctan2(v[:, 1], v[:, 0]), 0.02 * np.sin(0.9 * at), 0.02 * np.cos(1.1 * at)]
-    R = Rotation.from_euler("ZYX", np.column_stack(turns)).as_matrix()
-    stamps = (1e9 * at).astype(np.int64) + 1_700_000_000_000_000_000
-    return Trajectory(stamps, R, p, "map", "lidar")
+    return ahead(at, p)
 
 
 def slam_drive(

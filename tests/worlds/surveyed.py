@@ -9,7 +9,7 @@ from l2m_gtsam.data import FieldSample, FloatArray, Recording, Trajectory
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap, masked
 from l2m_gtsam.maps.training import TrainingSet
-from tests.drives.slam import RATE_HZ, SPEED
+from tests.drives.slam import RATE_HZ, SPEED, ahead
 from tests.worlds.exact import DipoleWorld
 from tests.worlds.quick_maps import quick
 
@@ -70,11 +70,7 @@ def wandering(rng: np.random.Generator, seconds: float, within: float = 3.2) -> 
         yaw += turn / RATE_HZ
         place = place + SPEED / RATE_HZ * np.array([np.cos(yaw), np.sin(yaw)])
     p[:, 2] = 0.5 + 0.03 * np.sin(1.3 * at)
-    v = np.asarray(np.gradient(p, at, axis=0))
-    turns = [np.arctan2(v[:, 1], v[:, 0]), 0.02 * np.sin(0.9 * at), 0.02 * np.cos(1.1 * at)]
-    R = Rotation.from_euler("ZYX", np.column_stack(turns)).as_matrix()
-    stamps = (1e9 * at).astype(np.int64) + 1_700_000_000_000_000_000
-    return Trajectory(stamps, R, p, "map", "lidar")
+    return ahead(at, p)
 
 
 def in_odometry(recording: Recording, rng: np.random.Generator) -> Recording:
