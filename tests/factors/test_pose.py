@@ -27,12 +27,12 @@ from tests.support.factor_inputs import (
     SENSORS,
     CountingWorld,
     calibrations,
-    moving,
     on,
     random_carried,
     step_error,
     values_for,
     whitenings,
+    with_motion,
 )
 from tests.worlds.exact import dipole_world
 
@@ -43,7 +43,7 @@ def test_jacobians_match_central_differences(seed: int) -> None:
     """By pose, place, distortion, time offset, errors of map and step: 1e-6 of the largest."""
     world, values, readings = dipole_world(seed), values_for(seed, 3), random_carried(seed)
     step = step_error(seed, 4, values)
-    timed = moving(readings, seed)
+    timed = with_motion(readings, seed)
     features = np.random.default_rng(seed).normal(size=(4, 3, MODES))
     shared = [SharedError(M(7), features)]
     W = whitenings(seed, 4)

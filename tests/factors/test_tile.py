@@ -21,11 +21,11 @@ from l2m_factors import (
 )
 from tests.support.factor_inputs import (
     calibrations,
-    moving,
     on,
     random_carried,
     step_error,
     whitenings,
+    with_motion,
 )
 from tests.support.tile_inputs import BASIS, TILE, tile_values
 
@@ -52,7 +52,7 @@ def test_derivatives_by_a_step_are_those_of_finite_differences(
 @settings(deadline=None, max_examples=10)
 def test_derivatives_are_those_of_finite_differences(seed: int, free: bool, timed: bool) -> None:
     readings, values = random_carried(seed), tile_values(seed)
-    readings = moving(readings, seed) if timed else readings
+    readings = with_motion(readings, seed) if timed else readings
     batch = batch_of(readings, 0, None if free else values)
     for k in batch.key_poses:
         factor = tile_factor(batch, k, whitenings(seed, len(batch.rows_of(k))))

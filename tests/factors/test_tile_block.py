@@ -22,7 +22,7 @@ from l2m_factors import (
     tile_residual,
 )
 from l2m_gtsam.data import FloatArray
-from tests.support.factor_inputs import calibrations, moving, random_carried
+from tests.support.factor_inputs import calibrations, random_carried, with_motion
 from tests.support.tile_inputs import BASIS, TILE, tile_values
 
 ROUNDING = 1e-10  # of uT and uT/m, up to a few hundred
@@ -62,7 +62,7 @@ def test_a_block_is_its_key_poses_together(
     seed: int, free: bool, timed: bool, anchor: int, chosen: set[int]
 ) -> None:
     readings, values, key_poses = random_carried(seed), tile_values(seed, 3), sorted(chosen)
-    readings = moving(readings, seed) if timed else readings
+    readings = with_motion(readings, seed) if timed else readings
     W, fixed = random_whitening(seed, len(readings)), None if free else calibrations(values)
     batch = TileBatch(TILE, anchor, BASIS, readings, fixed)
     white = {k: Whitening.independent(W[batch.rows_of(k)]) for k in key_poses}

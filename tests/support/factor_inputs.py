@@ -1,6 +1,7 @@
 """Random readings, poses and values for tests of factors."""
 
 from dataclasses import replace
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -22,6 +23,8 @@ from l2m_factors import (
 from l2m_gtsam.data import FloatArray, Readings
 from tests.worlds.exact import DipoleWorld
 
+AnyReadings = TypeVar("AnyReadings", MagneticReadings, KeyPoseReadings)
+
 SENSORS = 2
 MODES = 4  # of a map's error
 
@@ -32,7 +35,7 @@ def as_magnetic(readings: Readings) -> MagneticReadings:
     )
 
 
-def with_motion(readings: MagneticReadings, seed: int) -> MagneticReadings:
+def with_motion(readings: AnyReadings, seed: int) -> AnyReadings:
     """Return readings of a lidar that turns by up to 1 rad/s and moves by up to 2 m/s."""
     rng, n = np.random.default_rng(seed), len(readings)
     twist = np.hstack([rng.uniform(-1, 1, (n, 3)), rng.uniform(-2, 2, (n, 3))])
@@ -76,12 +79,6 @@ def random_carried(seed: int, key_poses: int = 2, each: int = 4) -> KeyPoseReadi
 
 def on(readings: KeyPoseReadings, key_pose: int) -> KeyPoseReadings:
     return readings[np.flatnonzero(readings.key_pose == key_pose)]
-
-
-def moving(readings: KeyPoseReadings, seed: int) -> KeyPoseReadings:
-    rng, n = np.random.default_rng(seed), len(readings)
-    twist = np.hstack([rng.uniform(-1, 1, (n, 3)), rng.uniform(-2, 2, (n, 3))])
-    return replace(readings, motion=PoseMotion(twist, rng.uniform(-0.02, 0.02, n)))
 
 
 def values_for(seed: int, key_poses: int = 2) -> gtsam.Values:
