@@ -1,7 +1,6 @@
 """Drives of a vehicle whose motor adds a field of its own, over a map that knows its errors."""
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,23 +16,10 @@ from l2m_gtsam.data import (
     SourceFile,
     Trajectory,
 )
-from l2m_gtsam.maps.harmonic.family import Hyperparameters
-from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
-from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.records.calibration import Uncertainty
-from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors
+from tests.drives.uncertain import NOISE, WORLD, small_sensors
 
 STEP_NS, START_NS = 50_000_000, 1_700_000_000_000_000_000
-NOISE = 0.1  # uT
-GIVEN = Hyperparameters(
-    floor_scale=6.0, floor_depth=0.7, ceiling_scale=2.0, ceiling_depth=1.4, noise=0.2
-)
-CALM = dipole_world(1)
-WORLD = DipoleWorld(CALM.uniform, CALM.positions, 4 * CALM.moments)
-OPTIONS = HarmonicOptions(
-    hyperparameters=GIVEN, search=SearchOptions(rounds=0), modes=200, mode_share=0.5
-)
 
 
 @dataclass(frozen=True)
@@ -65,15 +51,6 @@ class MovingDrive:
         return np.asarray(found - np.concatenate([known.t_lidar_mag, known.distortion.vector()]))
 
 
-@cache
-def surveyed(seed: int) -> HarmonicMap:
-    """Return the map of a survey of 700 readings."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform([-1.5, -1.5, 0.2], [1.5, 1.5, 0.8], (700, 3))
-    field = WORLD.field_and_gradient(points)[0] + rng.normal(0, GIVEN.noise, points.shape)
-    return HarmonicMap.fit(points, field, OPTIONS)
-
-
 def current(seed: int, seconds: FloatArray) -> FloatArray:
     """Return a motor's current in A that swings slowly about 5 A, shape (N,)."""
     rng = np.random.default_rng([seed, 2])
@@ -101,10 +78,7 @@ def moving_drive(
     seconds: FloatArray = np.arange(count, dtype=float) * (STEP_NS * 1e-9)
     amperes = current(seed, seconds) if amperes is None else amperes
     trajectory = _trajectory(rng, seconds)
-    small = tuple(
-        KnownSensor(each.sensor, 0.3 * each.t_lidar_mag, each.distortion)
-        for each in random_sensors(seed, len(strengths))
-    )
+    small = small_sensors(len(strengths), seed)
     h = rng.normal(size=(len(strengths), 3))
     h *= np.array(strengths)[:, None] / np.linalg.norm(h, axis=1)[:, None]
     series = tuple(

@@ -24,10 +24,11 @@ OPTIONS = HarmonicOptions(
 )
 
 
-def small_sensors(count: int) -> tuple[KnownSensor, ...]:
+def small_sensors(count: int, seed: int = 3) -> tuple[KnownSensor, ...]:
     """Sensors within 0.2 m of the lidar."""
     return tuple(
-        KnownSensor(s.sensor, 0.3 * s.t_lidar_mag, s.distortion) for s in random_sensors(3, count)
+        KnownSensor(s.sensor, 0.3 * s.t_lidar_mag, s.distortion)
+        for s in random_sensors(seed, count)
     )
 
 
@@ -36,21 +37,26 @@ STARTS = np.stack([s.t_lidar_mag for s in SENSORS]) + 0.05
 
 
 @cache
-def surveyed_map() -> HarmonicMap:
-    """A survey of 700 readings in nine tiles and more."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-1.5, -1.5, 0.2], [1.5, 1.5, 0.8], (700, 3))
+def surveyed(seed: int = 0, count: int = 700) -> HarmonicMap:
+    """Return the map of a survey, in nine tiles and more."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-1.5, -1.5, 0.2], [1.5, 1.5, 0.8], (count, 3))
     field = WORLD.field_and_gradient(points)[0] + rng.normal(0, GIVEN.noise, points.shape)
     return HarmonicMap.fit(points, field, OPTIONS)
+
+
+def turning_poses(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
+    """Poses ``R_map_lidar`` and ``p_map_lidar`` anywhere in the survey, tilted a little."""
+    angles = np.column_stack([rng.uniform(-np.pi, np.pi, count), rng.normal(0, 0.15, (count, 2))])
+    R = Rotation.from_euler("ZYX", angles).as_matrix()
+    return R, np.column_stack([rng.uniform(-1.1, 1.1, (count, 2)), rng.uniform(0.4, 0.6, count)])
 
 
 def turning_drive(count: int = 150) -> Readings:
     """A drive over all of the survey, turning, tilting and heaving; readings of each sensor."""
     rng = np.random.default_rng(1)
     N = count * len(SENSORS)
-    angles = np.column_stack([rng.uniform(-np.pi, np.pi, N), rng.normal(0, 0.15, (N, 2))])
-    R = Rotation.from_euler("ZYX", angles).as_matrix()
-    p = np.column_stack([rng.uniform(-1.1, 1.1, (N, 2)), rng.uniform(0.4, 0.6, N)])
+    R, p = turning_poses(rng, N)
     sensor = np.repeat(np.arange(len(SENSORS)), count)
     t = np.stack([s.t_lidar_mag for s in SENSORS])[sensor]
     B, _ = WORLD.field_and_gradient(np.einsum("nij,nj->ni", R, t) + p)

@@ -27,17 +27,12 @@ from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.solve.noise import HALF
-from tests.drives.uncertain import STARTS, surveyed_map, turning_drive
+from tests.drives.uncertain import STARTS, turning_drive
 from tests.reference.elimination import eliminate
 
 # What a calibration has by default, but for the forms and methods that are compared.
 DEFAULT = OneKeyOptions()
 WAYS = [(form, method) for form in FactorForm for method in Optimizer]
-
-
-@pytest.fixture(scope="module")
-def field_map() -> HarmonicMap:
-    return surveyed_map()
 
 
 @pytest.fixture(scope="module")

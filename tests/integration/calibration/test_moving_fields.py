@@ -21,7 +21,8 @@ from l2m_gtsam.records.calibration import (
 )
 from l2m_gtsam.records.sensor_models import Model
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
-from tests.drives.moving import STEP_NS, WORLD, MovingDrive, moving_drive, options, surveyed
+from tests.drives.moving import STEP_NS, MovingDrive, moving_drive, options
+from tests.drives.uncertain import WORLD, surveyed
 from tests.support.records import assert_equal
 
 SEED = 1

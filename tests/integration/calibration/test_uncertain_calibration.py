@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, eigh
-from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.coverage import UncertainMap
@@ -26,8 +25,7 @@ from tests.drives.uncertain import (
     WORLD,
     all_features,
     dense_rows,
-    surveyed_map,
-    turning_drive,
+    turning_poses,
 )
 from tests.worlds.exact import DipoleWorld
 
@@ -35,16 +33,6 @@ FULL, INDEPENDENT = (  # the drive's frame is the map's
     OneKeyOptions(uncertainty=kind, sensor_noise_ut=NOISE, warp_m=0)
     for kind in (Uncertainty.FULL, Uncertainty.INDEPENDENT)
 )
-
-
-@pytest.fixture(scope="module")
-def field_map() -> HarmonicMap:
-    return surveyed_map()
-
-
-@pytest.fixture(scope="module")
-def readings() -> Readings:
-    return turning_drive()
 
 
 @pytest.fixture(scope="module")
@@ -200,9 +188,7 @@ def test_a_sensor_that_leaves_the_map_on_the_way_is_not_settled() -> None:
     weak = GIVEN.model_copy(update={"floor_scale": 0.048, "ceiling_scale": 0.015})
     options = OPTIONS.model_copy(update={"hyperparameters": weak})
     poor = HarmonicMap.fit(points, field, options)
-    angles = np.column_stack([rng.uniform(-np.pi, np.pi, count), rng.normal(0, 0.15, (count, 2))])
-    R = Rotation.from_euler("ZYX", angles).as_matrix()
-    p = np.column_stack([rng.uniform(-1.1, 1.1, (count, 2)), rng.uniform(0.4, 0.6, count)])
+    R, p = turning_poses(rng, count)
     t = np.array([0.1, 0.0, 0.05])
     b = np.einsum("nji,nj->ni", R, faint.field_and_gradient(R @ t + p)[0])
     b = b + rng.normal(0, NOISE, b.shape)

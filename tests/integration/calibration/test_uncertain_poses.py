@@ -20,8 +20,6 @@ from tests.drives.uncertain import (
     STARTS,
     all_features,
     dense_rows,
-    surveyed_map,
-    turning_drive,
 )
 
 LASTS_S = 0.7
@@ -31,16 +29,6 @@ OPTIONS = OneKeyOptions(
     pose_noise=PoseNoiseOptions(correlation_s=LASTS_S),
     robust=RobustOptions(loss=Loss.SQUARED),
 )
-
-
-@pytest.fixture(scope="module")
-def field_map() -> HarmonicMap:
-    return surveyed_map()
-
-
-@pytest.fixture(scope="module")
-def readings() -> Readings:
-    return turning_drive()
 
 
 @pytest.fixture(scope="module")

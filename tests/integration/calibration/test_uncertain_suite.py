@@ -18,7 +18,6 @@ from tests.drives.uncertain import (
     SENSORS,
     STARTS,
     WORLD,
-    turning_drive,
 )
 
 # What a good suite is known to: 3 mm, 0.5 % and 0.3 degrees, 0.3 uT.
@@ -72,16 +71,11 @@ def distances(solution: OneKeySolution) -> list[float]:
     return found
 
 
-@pytest.fixture(scope="module")
-def drive() -> Readings:
-    return turning_drive()
-
-
 @pytest.mark.parametrize("surveys", [3, pytest.param(12, marks=pytest.mark.study)])
-def test_a_suite_that_is_off_as_stated_makes_true_sigmas(drive: Readings, surveys: int) -> None:
+def test_a_suite_that_is_off_as_stated_makes_true_sigmas(readings: Readings, surveys: int) -> None:
     found = []
     for seed in range(surveys):
-        solution = solve_one_key(drive, survey(seed), STARTS, SOLVE)
+        solution = solve_one_key(readings, survey(seed), STARTS, SOLVE)
         assert solution.settled
         found.append(np.mean(distances(solution)))
     # 15 are expected. Both sensors share the survey's errors and the drive its noise, so that a
@@ -91,9 +85,9 @@ def test_a_suite_that_is_off_as_stated_makes_true_sigmas(drive: Readings, survey
     assert low < np.mean(found) < high
 
 
-def test_a_suite_that_is_off_and_taken_for_exact_makes_sigmas_too_small(drive: Readings) -> None:
+def test_a_suite_that_is_off_and_taken_for_exact_makes_sigmas_too_small(readings: Readings) -> None:
     found = [
-        distances(solve_one_key(drive, survey(seed, stated=False), STARTS, SOLVE))
+        distances(solve_one_key(readings, survey(seed, stated=False), STARTS, SOLVE))
         for seed in (0, 1)
     ]
     assert np.mean(found) > 40

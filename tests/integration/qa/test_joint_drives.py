@@ -23,8 +23,9 @@ from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.record_files import read_metrics, write_metrics
 from tests.drives.degenerate import STRONG, at_height, poses
-from tests.drives.moving import moving_drive, surveyed
+from tests.drives.moving import moving_drive
 from tests.drives.moving import options as moving_options
+from tests.drives.uncertain import surveyed
 from tests.drives.verdict import NOISE, NOMINAL, SENSORS, read
 from tests.worlds.exact import DipoleWorld
 

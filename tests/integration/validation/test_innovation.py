@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from l2m_factors import skew
 from l2m_gtsam.calibration.pose_errors import pose_seconds
@@ -17,7 +16,7 @@ from l2m_gtsam.validation.innovation import (
     marginalise_calibration,
 )
 from tests.drives.calibrations import SIGMA
-from tests.drives.uncertain import GIVEN, NOISE, OPTIONS, WORLD, small_sensors
+from tests.drives.uncertain import NOISE, WORLD, small_sensors, surveyed, turning_poses
 
 SENSOR = small_sensors(1)[0]
 COUNT = 60
@@ -26,20 +25,14 @@ LASTS_S = 1.0
 
 @pytest.fixture(scope="module")
 def field_map() -> HarmonicMap:
-    """A survey of 500 readings."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-1.5, -1.5, 0.2], [1.5, 1.5, 0.8], (500, 3))
-    field = WORLD.field_and_gradient(points)[0] + rng.normal(0, GIVEN.noise, points.shape)
-    return HarmonicMap.fit(points, field, OPTIONS)
+    return surveyed(0, 500)
 
 
 @pytest.fixture(scope="module")
 def readings() -> Readings:
     """A drive over the survey, with a recorded number."""
     rng = np.random.default_rng(1)
-    angles = np.column_stack([rng.uniform(-np.pi, np.pi, COUNT), rng.normal(0, 0.15, (COUNT, 2))])
-    R = Rotation.from_euler("ZYX", angles).as_matrix()
-    p = np.column_stack([rng.uniform(-1.1, 1.1, (COUNT, 2)), rng.uniform(0.4, 0.6, COUNT)])
+    R, p = turning_poses(rng, COUNT)
     B, _ = WORLD.field_and_gradient(R @ SENSOR.t_lidar_mag + p)
     field = SENSOR.distortion.apply(np.einsum("nji,nj->ni", R, B))
     return Readings(
