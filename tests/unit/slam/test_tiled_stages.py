@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.progress import silent
-from l2m_gtsam.slam.drive import EXACT_START, KnownSensors
+from l2m_gtsam.slam.drive import EXACT_START, Drive, KnownSensors
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import drive_values
@@ -36,6 +36,14 @@ QUICK = SlamOptions.model_validate(
 )
 
 
+def lapped() -> Drive:
+    """Laps in a field that lasts."""
+    own = random_sensors(2, 4)
+    recorded = slam_drive(dipole_world(2), own, laps(20, (1.9, 1.4)), np.random.default_rng(2))
+    drive, _ = prepared(recorded.recording, calibrated(own), QUICK)
+    return replace(drive, start=replace(drive.start, covariance=EXACT_START))
+
+
 def test_only_where_steel_was_moved_visits_find_another_field() -> None:
     """At the true poses of four laps past a pallet, moved after the second or not."""
     made = moved_steel(2)
@@ -54,10 +62,7 @@ def test_only_where_steel_was_moved_visits_find_another_field() -> None:
 
 def test_a_drive_whose_field_lasts_is_solved_once() -> None:
     """And its density is above that of the same tiles with readings of another field."""
-    own = random_sensors(2, 4)
-    recorded = slam_drive(dipole_world(2), own, laps(20, (1.9, 1.4)), np.random.default_rng(2))
-    drive, _ = prepared(recorded.recording, calibrated(own), QUICK)
-    drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
+    drive = lapped()
     poses, stages = drive.dead_reckoning(), list[str]()
     prior = drive_prior(drive, poses, QUICK.tiles)
 
@@ -91,10 +96,7 @@ class TwoPlaces:
 @pytest.fixture
 def two_places(monkeypatch: pytest.MonkeyPatch) -> TwoPlaces:
     """Laps whose pieces stay as given; with much noise the less likely one looks likelier."""
-    own = random_sensors(2, 4)
-    recorded = slam_drive(dipole_world(2), own, laps(20, (1.9, 1.4)), np.random.default_rng(2))
-    drive, _ = prepared(recorded.recording, calibrated(own), QUICK)
-    drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
+    drive = lapped()
     prior = drive_prior(drive, drive.dead_reckoning(), QUICK.tiles)
     likely = ReturnSearch.density
 
