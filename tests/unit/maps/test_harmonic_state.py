@@ -8,19 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from l2m_gtsam.data import MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
+from tests.support.map_files import through_a_file
 from tests.worlds.harmonic import assert_same, queries, readings
 
 pytestmark = pytest.mark.usefixtures("affordable")
-
-
-def through_a_file(state: MapState) -> MapState:
-    """What is left of a state when options and provenance went through JSON."""
-    options, provenance = json.loads(json.dumps([state.options, state.provenance]))
-    return MapState(state.kind, state.arrays, options, provenance)
 
 
 def test_a_map_comes_back_from_its_state(harmonic: HarmonicMap) -> None:

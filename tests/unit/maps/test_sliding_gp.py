@@ -1,4 +1,3 @@
-import json
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +19,7 @@ from l2m_gtsam.maps.hyperparameters import KernelHyperparameters, KernelLearning
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
 from l2m_gtsam.maps.training import ThinningOptions, thinned, training_set
 from tests.support.central_differences import slopes
+from tests.support.map_files import through_a_file
 from tests.worlds.exact import dipole_world
 from tests.worlds.quick_maps import quick
 
@@ -196,12 +196,6 @@ def test_a_vehicle_at_rest_counts_no_more_than_allowed() -> None:
     readings_at_rest = training_set(rest, np.vstack([field, np.tile(field[:1], (5000, 1))]))
     merged = thinned(readings_at_rest, 0.5, ThinningOptions(independent=7))
     assert merged.weight.max() == 7
-
-
-def through_a_file(state: MapState) -> MapState:
-    """What is left of a state when options and provenance went through JSON."""
-    options, provenance = json.loads(json.dumps([state.options, state.provenance]))
-    return MapState(state.kind, state.arrays, options, provenance)
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
