@@ -233,6 +233,11 @@ def stacked(poses: Sequence[gtsam.Pose3]) -> tuple[FloatArray, FloatArray]:
     return R, np.stack([pose.translation() for pose in poses])
 
 
+def as_poses(R: FloatArray, p: FloatArray) -> list[gtsam.Pose3]:
+    """Return the poses of ``stacked`` rotations and positions."""
+    return [gtsam.Pose3(gtsam.Rot3(turn), place) for turn, place in zip(R, p, strict=True)]
+
+
 def as_transform(pose: gtsam.Pose3) -> RigidTransform:
     """Return GTSAM's pose as a transform."""
     return RigidTransform(pose.rotation().matrix(), pose.translation())

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, KnownSensor, RigidTransform, Trajectory
-from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
+from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_poses
 from l2m_gtsam.slam.odometry import odometry_steps
 from l2m_gtsam.slam.options import DriftOptions
 from tests.drives.slam import Field
@@ -29,6 +30,11 @@ class DrawnDrive:
     R: FloatArray
     p: FloatArray
     calibration: FloatArray
+
+    @property
+    def poses(self) -> list[gtsam.Pose3]:
+        """The true key poses."""
+        return as_poses(self.R, self.p)
 
 
 def drawn_drive(

@@ -8,14 +8,16 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.slam.drive import EXACT_START, Drive
+from l2m_gtsam.slam.drive import EXACT_START, Drive, as_poses
 from l2m_gtsam.slam.exploration import Exploration, explore
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
+from l2m_gtsam.studies.statistics import nees
 from tests.drives.slam import SlamDrive, calibrated, slam_drive
+from tests.support.pose_errors import pose_errors
 from tests.worlds.exact import dipole_world
 
 COARSE = {"distance_m": 0.3, "readings": 2}  # enough, and quick
@@ -58,12 +60,8 @@ class OnLine:
         return np.array([np.linalg.norm(a.translation() - b.translation()) for a, b in pairs])
 
     def nees(self) -> FloatArray:
-        errors = [
-            gtsam.Pose3.Logmap(belief.pose.between(true))
-            for belief, true in zip(self.beliefs, self.truth, strict=True)
-        ]
-        pairs = zip(errors, self.beliefs, strict=True)
-        return np.array([e @ np.linalg.solve(known.pose_covariance, e) for e, known in pairs])
+        errors = pose_errors([each.pose for each in self.beliefs], self.truth)
+        return nees(errors, np.stack([each.pose_covariance for each in self.beliefs]))
 
 
 def rms(off: FloatArray) -> float:
@@ -81,7 +79,7 @@ def prepared_drive(
     recorded = slam_drive(dipole_world(seed), sensors, truth, np.random.default_rng(seed))
     drive, _ = prepared(recorded.recording, known, options)
     rows = np.searchsorted(truth.stamp_ns, drive.stamp_ns)
-    true = [gtsam.Pose3(gtsam.Rot3(truth.R[row]), truth.p[row]) for row in rows]
+    true = as_poses(truth.R[rows], truth.p[rows])
     return replace(drive, start=replace(drive.start, covariance=EXACT_START)), true
 
 

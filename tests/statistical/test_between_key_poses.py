@@ -10,9 +10,11 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
+from l2m_gtsam.studies.statistics import nees
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.following import followed_beliefs
 from tests.drives.slam import rounds
+from tests.support.pose_errors import pose_errors
 from tests.worlds.exact import dipole_world, random_sensors
 
 DRIVES, SECONDS, NOISE = 10, 30, 0.2
@@ -50,10 +52,8 @@ def errors(
     drawn: DrawnDrive, poses: list[gtsam.Pose3], covariance: FloatArray, every: int
 ) -> Errors:
     """Compare each so manieth key pose with the truth."""
-    truth = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
-    off = np.stack([gtsam.Pose3.Logmap(a.between(b)) for a, b in zip(poses, truth, strict=True)])
-    off, P = off[::every], covariance[::every]
-    squared = np.einsum("ni,ni->n", off, np.linalg.solve(P, off[:, :, None])[:, :, 0])
+    off = pose_errors(poses, drawn.poses)[::every]
+    squared = nees(off, covariance[::every])
     return Errors(float(squared.mean()), float(np.sqrt(np.mean(np.sum(off[:, 3:] ** 2, axis=1)))))
 
 
@@ -87,15 +87,15 @@ def test_walks_of_odometry_between_key_poses_are_told(sensors: int) -> None:
             for seed in range(DRIVES)
         ]
     )
-    for name, (nees, position) in zip(
+    for name, (each, position) in zip(
         ("together", "on line", "key poses at readings", "these on line"),
         figures.transpose(1, 2, 0),
         strict=True,
     ):
-        error = nees.std(ddof=1) / np.sqrt(DRIVES)
+        error = each.std(ddof=1) / np.sqrt(DRIVES)
         rms = 1e3 * np.sqrt(np.mean(position**2))
-        print(f"{sensors} sensors, {name}: NEES {nees.mean():.2f} +- {error:.2f}, {rms:.1f} mm")
-        assert abs(nees.mean() - 6) < 3 * error
+        print(f"{sensors} sensors, {name}: NEES {each.mean():.2f} +- {error:.2f}, {rms:.1f} mm")
+        assert abs(each.mean() - 6) < 3 * error
     rms = np.sqrt(np.mean(figures[:, :, 1] ** 2, axis=0))
     assert rms[0] < 1.03 * rms[2]
     assert rms[1] < 1.1 * rms[3]

@@ -11,9 +11,11 @@ from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
+from l2m_gtsam.studies.statistics import nees
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.following import followed_beliefs
 from tests.drives.slam import rounds
+from tests.support.pose_errors import mean_nees
 from tests.worlds.exact import dipole_world, random_sensors
 
 DRIVES, SENSORS, SECONDS = 50, 3, 60
@@ -52,26 +54,16 @@ def vectors(sensors: KnownSensors) -> FloatArray:
     return np.hstack([sensors.t, sensors.distortion])
 
 
-def squared(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return squared lengths of errors (N, k) in units of their covariances (N, k, k)."""
-    solved = np.linalg.solve(covariance, error[:, :, None])[:, :, 0]
-    return np.asarray(np.einsum("ni,ni->n", error, solved))
-
-
-def nees(
+def nees_of(
     drawn: DrawnDrive,
     poses: list[gtsam.Pose3],
     pose_covariance: FloatArray,
     sensors: KnownSensors,
     covariance: FloatArray,
 ) -> Nees:
-    truth = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
-    off = np.stack(
-        [gtsam.Pose3.Logmap(pose.between(each)) for pose, each in zip(poses, truth, strict=True)]
-    )
     wrong = drawn.calibration - vectors(sensors)
     return Nees(
-        float(squared(off, pose_covariance).mean()), float(squared(wrong, covariance).mean())
+        mean_nees(poses, pose_covariance, drawn.poses), float(nees(wrong, covariance).mean())
     )
 
 
@@ -81,7 +73,7 @@ def one_drive(seed: int) -> Outcome:
     drawn = drawn_drive(world, sensors, truth, rng, FAR, every=EVERY)
     beliefs = followed_beliefs(drawn.drive, world, RobustOptions(), free=True)
     last = beliefs[-1]
-    on_line = nees(
+    on_line = nees_of(
         drawn,
         [each.pose for each in beliefs],
         np.stack([each.pose_covariance for each in beliefs]),
@@ -90,7 +82,7 @@ def one_drive(seed: int) -> Outcome:
     )
     solved = localise_drive(drawn.drive, world, REFINED, lambda _stage, _share: None)
     covariance = solved.calibration_covariance
-    batch = nees(drawn, solved.poses, solved.pose_covariance, solved.drive.sensors, covariance)
+    batch = nees_of(drawn, solved.poses, solved.pose_covariance, solved.drive.sensors, covariance)
     sigma = np.sqrt(np.einsum("sii->si", covariance))
     apart = np.abs(vectors(last.sensors) - vectors(solved.drive.sensors)) / sigma
     print(

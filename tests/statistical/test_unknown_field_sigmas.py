@@ -4,7 +4,7 @@ Elsewhere odometry slips: an error that its sigmas hold, but do not describe, so
 little. Here every step errs as the graph has it, with no steady drift.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -12,13 +12,14 @@ import pytest
 
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.progress import silent
-from l2m_gtsam.slam.drive import EXACT_START, Drive, StartPose
+from l2m_gtsam.slam.drive import EXACT_START, StartPose
 from l2m_gtsam.slam.exploration import solve_field
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import ExploringOptions
-from tests.drives.drawn import DRIFT, drawn_drive
+from tests.drives.drawn import DRIFT, DrawnDrive, drawn_drive
 from tests.drives.exploring import OnLine
 from tests.drives.slam import laps
+from tests.support.pose_errors import mean_nees
 from tests.worlds.exact import dipole_world, random_sensors
 
 DRIVES, SENSORS, SECONDS = 18, 6, 90  # two and a half laps of 21 m
@@ -27,30 +28,20 @@ EXACT = np.full(15, 1e-6)
 OPTIONS = SlamOptions(drift=DRIFT)
 
 
-@dataclass(frozen=True)
-class DrawnPath:
-    """A drive from an exact start, and its true key poses."""
-
-    drive: Drive
-    truth: list[gtsam.Pose3]
-
-
-def path(seed: int) -> DrawnPath:
+def path(seed: int) -> DrawnDrive:
+    """Return a drive from an exact start."""
     whole = laps(SECONDS)
     rows = np.arange(0, len(whole), RATE)
     poses = whole[rows[: (len(rows) - 1) // EVERY * EVERY + 1]]
     rng, sensors = np.random.default_rng(1000 + seed), random_sensors(seed, SENSORS)
     drawn = drawn_drive(dipole_world(seed), sensors, poses, rng, EXACT, every=EVERY)
     start = StartPose(RigidTransform(drawn.R[0], drawn.p[0]), EXACT_START)
-    truth = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
-    return DrawnPath(replace(drawn.drive, start=start), truth)
+    return replace(drawn, drive=replace(drawn.drive, start=start))
 
 
 def nees(poses: list[gtsam.Pose3], covariance: FloatArray, truth: list[gtsam.Pose3]) -> float:
     """Return the mean over the poses after the first, whose sigmas are those of an exact start."""
-    pairs = zip(poses[1:], covariance[1:], truth[1:], strict=True)
-    errors = [(gtsam.Pose3.Logmap(pose.between(true)), P) for pose, P, true in pairs]
-    return float(np.mean([e @ np.linalg.solve(P, e) for e, P in errors]))
+    return mean_nees(poses[1:], covariance[1:], truth[1:])
 
 
 def assert_consistent(found: list[float]) -> None:
@@ -66,9 +57,9 @@ def test_on_line_poses_err_as_much_as_they_say() -> None:
     found = []
     for seed in range(DRIVES):
         drawn = path(seed)
-        online = OnLine.over(drawn.drive, drawn.truth, OPTIONS, ExploringOptions())
+        online = OnLine.over(drawn.drive, drawn.poses, OPTIONS, ExploringOptions())
         covariance = np.stack([each.pose_covariance for each in online.beliefs])
-        found.append(nees([each.pose for each in online.beliefs], covariance, drawn.truth))
+        found.append(nees([each.pose for each in online.beliefs], covariance, drawn.poses))
     assert_consistent(found)
 
 
@@ -79,5 +70,5 @@ def test_off_line_poses_err_as_much_as_they_say() -> None:
     for seed in range(DRIVES):
         drawn = path(seed)
         solution = solve_field(drawn.drive, OPTIONS, silent).solution
-        found.append(nees(solution.poses, solution.pose_covariance, drawn.truth))
+        found.append(nees(solution.poses, solution.pose_covariance, drawn.poses))
     assert_consistent(found)

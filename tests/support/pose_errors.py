@@ -1,11 +1,27 @@
-"""Errors of trajectories against the truth."""
+"""Errors of poses and trajectories against the truth."""
 
+from collections.abc import Sequence
+
+import gtsam
 import numpy as np
 from evo.core import metrics
 from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
+from l2m_gtsam.studies.statistics import nees
+
+
+def pose_errors(found: Sequence[gtsam.Pose3], truth: Sequence[gtsam.Pose3]) -> FloatArray:
+    """Return what poses are off by, as right perturbations, shape (K, 6)."""
+    return np.stack([gtsam.Pose3.Logmap(a.between(b)) for a, b in zip(found, truth, strict=True)])
+
+
+def mean_nees(
+    found: Sequence[gtsam.Pose3], covariance: FloatArray, truth: Sequence[gtsam.Pose3]
+) -> float:
+    """Return the mean of squared pose errors in sigmas: 6 where covariances are true."""
+    return float(nees(pose_errors(found, truth), covariance).mean())
 
 
 def at(trajectory: Trajectory, stamps: IntArray) -> PoseTrajectory3D:
@@ -29,5 +45,4 @@ def pose_nees(truth: Trajectory, found: Trajectory) -> FloatArray:
     R_back = found.R.transpose(0, 2, 1)
     turn = Rotation.from_matrix(R_back @ truth.R[rows]).as_rotvec()
     shift = np.einsum("nij,nj->ni", R_back, truth.p[rows] - found.p)
-    error = np.hstack([turn, shift])[:, :, None]
-    return np.asarray((error * np.linalg.solve(found.covariance, error)).sum(axis=(1, 2)))
+    return nees(np.hstack([turn, shift]), found.covariance)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, RigidTransform, joined
 from l2m_gtsam.maps.potential import PotentialHyperparameters
+from l2m_gtsam.slam.drive import as_poses
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.links import Links
@@ -55,8 +56,7 @@ def packed_poses(poses: Sequence[gtsam.Pose3]) -> Arrays:
 
 def unpacked_poses(arrays: Arrays) -> list[gtsam.Pose3]:
     """Return poses of ``packed_poses``."""
-    pairs = zip(arrays["R"], arrays["p"], strict=True)
-    return [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in pairs]
+    return as_poses(arrays["R"], arrays["p"])
 
 
 def packed_key_poses(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:

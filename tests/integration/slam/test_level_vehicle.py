@@ -3,15 +3,17 @@
 from dataclasses import replace
 from functools import cache
 
-import gtsam
 import numpy as np
 
 from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.drift import drift_covariance
+from l2m_gtsam.slam.drive import stacked
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
+from l2m_gtsam.studies.slam.methods import rms
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.slam import rounds
+from tests.support.pose_errors import mean_nees
 from tests.worlds.exact import dipole_world, random_sensors
 
 SEEDS = range(6)
@@ -43,12 +45,8 @@ def errors(seed: int, *, level: bool) -> tuple[float, float]:
         covariance = drift_covariance(steps.R, steps.p, ALIKE)
         drive = replace(drive, steps=replace(steps, covariance=covariance))
     found = localise_drive(drive, dipole_world(seed), SlamOptions(drift=ALIKE), silent)
-    truth = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
-    pairs = list(zip(found.poses, truth, strict=True))
-    off = np.stack([a.translation() - b.translation() for a, b in pairs])
-    error = np.stack([gtsam.Pose3.Logmap(a.between(b)) for a, b in pairs])
-    white = np.linalg.solve(found.pose_covariance, error[:, :, None])[:, :, 0]
-    return float(np.sqrt((off**2).sum(axis=1).mean())), float((error * white).sum(axis=1).mean())
+    off = rms(stacked(found.poses)[1], drawn.p)
+    return off, mean_nees(found.poses, found.pose_covariance, drawn.poses)
 
 
 def test_what_is_known_of_a_level_vehicle_makes_poses_better() -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from l2m_gtsam.data import FloatArray
 from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.disturbances import slips
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
@@ -19,6 +18,7 @@ from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.slam.solution import DriveSolution
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.slam import rounds
+from tests.support.pose_errors import mean_nees, pose_errors
 from tests.worlds.exact import dipole_world, random_sensors
 
 SEEDS, SIGMA = tuple(range(8)), 0.02
@@ -55,16 +55,8 @@ def localised(seed: int) -> DriveSolution:
     return localise_drive(scaled(seed).drawn.drive, dipole_world(seed), options, silent)
 
 
-def off(drawn: DrawnDrive, poses: list[gtsam.Pose3]) -> FloatArray:
-    """Return what poses are off by, as right perturbations, shape (K, 6)."""
-    truth = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
-    return np.stack([gtsam.Pose3.Logmap(a.between(b)) for a, b in zip(poses, truth, strict=True)])
-
-
 def nees(drawn: DrawnDrive, solution: DriveSolution) -> float:
-    error = off(drawn, solution.poses)
-    white = np.linalg.solve(solution.pose_covariance, error[:, :, None])[:, :, 0]
-    return float(np.einsum("ni,ni->n", error, white).mean())
+    return mean_nees(solution.poses, solution.pose_covariance, drawn.poses)
 
 
 def test_the_scale_is_found_as_well_as_it_says() -> None:
@@ -101,7 +93,7 @@ def test_odometry_alone_is_as_unsure_as_its_scale_makes_it() -> None:
     squared = []
     for seed in SEEDS:
         drawn = scaled(seed).drawn
-        error = off(drawn, drawn.drive.dead_reckoning())[-1]
+        error = pose_errors(drawn.drive.dead_reckoning(), drawn.poses)[-1]
         squared.append(error @ np.linalg.solve(odometry_covariance(drawn.drive)[-1], error))
     low, high = chi2.ppf(BAND, 6 * len(squared))
     assert low < np.sum(squared) < high

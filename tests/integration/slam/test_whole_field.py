@@ -12,7 +12,7 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult, Uncertainty
 from l2m_gtsam.slam.exploration import NOTHING_GAINED, Exploration, explore
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.studies.slam.methods import odometry_row, our_row, stated_drift
+from l2m_gtsam.studies.slam.methods import odometry_row, our_row, rms, stated_drift
 from l2m_gtsam.studies.slam.recordings import SHIP, DriftRecipe, Form, TrueDrive, drifted, ship_run
 from tests.drives.calibrations import sensor
 from tests.worlds.yard import NOISE as YARD_NOISE_UT
@@ -38,10 +38,6 @@ def stated(form: Form) -> SlamOptions:
     axes = "fixed" if form is Form.WORLD else "vehicle"
     drift = {"position_share": 0.0225, "rotation_deg_per_m": 0.16, "axes": axes}
     return SlamOptions.model_validate({"drift": drift, "key_poses": {"readings": 2}})
-
-
-def rms(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.sum((one - other) ** 2, axis=1))))
 
 
 def errors(drive: TrueDrive, form: Form, seed: int) -> tuple[float, float, tuple[str, ...]]:

@@ -87,7 +87,7 @@ def drawn() -> DrawnDrive:
 def test_the_likelihood_of_readings_is_that_of_their_normal_distribution(drawn: DrawnDrive) -> None:
     """Over all factors of the noise, tile by tile, without the readings that do not count."""
     drive, sensors = drawn.drive, drawn.drive.sensors
-    poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
+    poses = drawn.poses
     tiled = TiledDrive.lasting(RelativeMotions.along(drive, poses), poses, sensors, PRIOR)
     used = np.arange(len(drive.readings)) % 5 != 0
     total = np.zeros(len(NOISE))

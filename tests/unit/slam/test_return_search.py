@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.drive import EXACT_START, Drive
+from l2m_gtsam.slam.drive import EXACT_START, Drive, as_poses
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.relative_motion import RelativeMotions
@@ -69,7 +69,7 @@ def lap(seed: int, share: float) -> Lap:
     drive, _ = prepared(recording, calibrated(own), options)
     drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
     rows = np.searchsorted(ONE_LAP.stamp_ns, drive.stamp_ns)
-    truth = [gtsam.Pose3(gtsam.Rot3(ONE_LAP.R[row]), ONE_LAP.p[row]) for row in rows]
+    truth = as_poses(ONE_LAP.R[rows], ONE_LAP.p[rows])
     prior = drive_prior(drive, drive.dead_reckoning(), options.tiles)
     search = ReturnSearch(drive, prior, FOLLOWED[0] * drive.sensors.noise, known=0, begun=0)
     return Lap(drive, search, truth)

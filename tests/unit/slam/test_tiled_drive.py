@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 
@@ -41,7 +40,7 @@ def counted(drawn: DrawnDrive, stated: float, spoilt: FloatArray, weights: Float
     ``spoilt`` is added to the squared lengths of residuals, shape (N,).
     """
     drive = drawn.drive
-    poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
+    poses = drawn.poses
     tiled = TiledDrive.lasting(RelativeMotions.along(drive, poses), poses, drive.sensors, PRIOR)
     noise = np.full(len(drive.sensors.names), stated)
     prediction = tiled.prediction(tiled.weights(drive.sensors, noise), drive.sensors)
@@ -78,7 +77,7 @@ def test_readings_that_do_not_count_say_nothing_of_the_noise(drawn: DrawnDrive) 
 def test_a_tile_without_readings_is_not_laid(drawn: DrawnDrive) -> None:
     """Its readings gone, the others keep their numbers and all of theirs."""
     drive = drawn.drive
-    poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
+    poses = drawn.poses
     motions = RelativeMotions.along(drive, poses)
     whole = TiledDrive.lasting(motions, poses, drive.sensors, PRIOR)
     assert len(whole.tiles) > 1

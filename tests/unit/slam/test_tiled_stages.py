@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.progress import silent
-from l2m_gtsam.slam.drive import EXACT_START, Drive, KnownSensors
+from l2m_gtsam.slam.drive import EXACT_START, Drive, KnownSensors, as_poses
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import drive_values
@@ -53,7 +53,7 @@ def test_only_where_steel_was_moved_visits_find_another_field() -> None:
         for each in (made.still, made.moved)
     )
     rows, true = np.searchsorted(made.still.truth.stamp_ns, still.stamp_ns), made.still.truth
-    poses = [gtsam.Pose3(gtsam.Rot3(true.R[row]), true.p[row]) for row in rows]
+    poses = as_poses(true.R[rows], true.p[rows])
     # Learnt over the first metres, which both have in common.
     prior = drive_prior(still, poses, QUICK.tiles)
     assert not finds_changes(still, poses, prior)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.drive import as_poses
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.localisation import known_sensors
 from l2m_gtsam.slam.online.belief import Belief
@@ -38,7 +39,7 @@ def way_of(seed: int, of_height: float = 1.0, seconds: float = 30.0) -> Way:
     """Return rounds of half a metre a second, with a key pose each 0.1 s."""
     rng, every = np.random.default_rng(seed), rounds(seconds)
     path = every[np.arange(0, len(every), 2)]
-    truth = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(path.R, path.p, strict=True)]
+    truth = as_poses(path.R, path.p)
     drift, steady = rng.normal(size=3), SHARE * np.array([1.0, 1.0, of_height])
     first = ArrivedKeyPose.first(int(path.stamp_ns[0]), Links.none())
     covariance = np.diag([1e-10] * 3 + [STEP_M**2] * 3)
