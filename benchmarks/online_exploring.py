@@ -23,6 +23,7 @@ from l2m_gtsam.slam.online.replay import Message, give, messages, with_scans
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.studies.statistics import nees
 from tests.drives.exploring import rms
 from tests.drives.slam import SlamDrive, calibrated, laps, slam_drive
 from tests.support.pose_errors import pose_nees
@@ -129,12 +130,8 @@ def driven(seed: int, seconds: float, *, by_scans: bool) -> Run:
 
 def sensors_nees(own: KnownSensors, known: tuple[KnownSensor, ...]) -> float:
     """Return the mean over sensors of the NEES of (t, C, H)."""
-    found = []
-    for i, each in enumerate(known):
-        truth = np.concatenate([each.t_lidar_mag, each.distortion.vector()])
-        error = np.concatenate([own.t[i], own.distortion[i]]) - truth
-        found.append(error @ np.linalg.solve(own.covariance[i], error))
-    return float(np.mean(found))
+    error = own.vectors() - np.stack([each.vector() for each in known])
+    return float(nees(error, own.covariance).mean())
 
 
 def report(seconds: float) -> Table:

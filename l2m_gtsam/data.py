@@ -558,3 +558,7 @@ class KnownSensor:
     def ideal(cls, sensor: str) -> "KnownSensor":
         """Return a sensor without distortion at the lidar's origin."""
         return cls(sensor, np.zeros(3), Distortion.identity())
+
+    def vector(self) -> FloatArray:
+        """Return (t, C row by row, H) in m, 1 and uT, shape (15,)."""
+        return np.concatenate([self.t_lidar_mag, self.distortion.vector()])

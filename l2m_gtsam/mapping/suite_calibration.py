@@ -244,8 +244,7 @@ def suite_drive(
 
 def _parameters(sensor: KnownSensor) -> FloatArray:
     """Return (t, C row by row, H, time offset), shape (16,)."""
-    offset = [sensor.time_offset]
-    return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector(), offset])
+    return np.append(sensor.vector(), sensor.time_offset)
 
 
 def _check_ending(

@@ -325,6 +325,10 @@ class SensorCalibration:
     variance_shares: tuple[VarianceShare, ...] = ()
     common: Annotated[FloatArray, InFile(Rows16, np.atleast_2d)] | None = None
 
+    def vector(self) -> FloatArray:
+        """Return (t, C row by row, H) in m, 1 and uT, shape (15,)."""
+        return np.concatenate([self.t_lidar_mag, self.distortion.vector()])
+
     @property
     def offset_correlation(self) -> FloatArray:
         """Correlation of ``t_lidar_mag`` with the time offset, shape (3,); zero if it is held."""

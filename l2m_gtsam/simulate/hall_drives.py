@@ -65,8 +65,7 @@ class CalibrationDrive:
 
     def truth(self) -> FloatArray:
         """Return t, C row by row, H and time offset of every sensor, shape (S, 16)."""
-        rows = [np.concatenate([s.t_lidar_mag, s.distortion.vector()]) for s in self.sensors]
-        return np.column_stack([np.stack(rows), self.offset])
+        return np.column_stack([np.stack([s.vector() for s in self.sensors]), self.offset])
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,10 @@ class KnownSensors:
     noise: FloatArray
     covariance: FloatArray
 
+    def vectors(self) -> FloatArray:
+        """Return (t, C row by row, H) of each, shape (S, 15)."""
+        return np.hstack([self.t, self.distortion])
+
     def loosened(self, distortion: float, offset: float) -> "KnownSensors":
         """Return them with less certain C, and H in uT: by these standard deviations more."""
         more = np.concatenate([np.zeros(3), np.full(9, distortion**2), np.full(3, offset**2)])

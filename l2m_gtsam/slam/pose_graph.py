@@ -120,8 +120,7 @@ def link_squared(links: Links, values: gtsam.Values) -> FloatArray:
 def calibration_graph(sensors: KnownSensors) -> gtsam.NonlinearFactorGraph:
     """Return the priors of calibrations that are variables."""
     graph = gtsam.NonlinearFactorGraph()
-    for i, covariance in enumerate(sensors.covariance):
-        at = np.concatenate([sensors.t[i], sensors.distortion[i]])
+    for i, (at, covariance) in enumerate(zip(sensors.vectors(), sensors.covariance, strict=True)):
         graph.add(held_directions(i, stated_information_root(covariance), at))
     return graph
 

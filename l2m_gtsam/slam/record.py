@@ -226,7 +226,7 @@ def _refined(before: CalibrationResult, result: LocalisationResult) -> tuple[Ref
 
 
 def _change(before: SensorCalibration, after: SensorCalibration) -> RefinedSensor:
-    old, new = (np.append(each.t_lidar_mag, each.distortion.vector()) for each in (before, after))
+    old, new = (each.vector() for each in (before, after))
     whitened = stated_information_root(before.covariance) @ (new - old)
     low, high = quantile(BAND, len(PARAMETERS))
     return RefinedSensor(

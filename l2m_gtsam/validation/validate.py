@@ -288,11 +288,10 @@ def joint_covariance(sensor: SensorCalibration) -> FloatArray:
 
 
 def _known(recording: Recording, sensor: SensorCalibration) -> KnownCalibration:
-    offset = np.array([offset_s(sensor)])
-    vector = [sensor.t_lidar_mag, sensor.distortion.vector(), offset]
+    vector = np.append(sensor.vector(), offset_s(sensor))
     names = [each.name for each in recording.scalars]
     sigma = _of_numbers(names, {each.name: each.sigma for each in sensor.moving})
-    return KnownCalibration(np.concatenate(vector), sensor.noise, sigma)
+    return KnownCalibration(vector, sensor.noise, sigma)
 
 
 def _of_numbers(names: Sequence[str], values: dict[str, FloatArray]) -> FloatArray:

@@ -60,7 +60,7 @@ def drawn_drive(
     begin = perturbations(np.diag(START**2)[None], rng)
     R0, p0 = truth.R[0], truth.p[0]
     start = StartPose(RigidTransform(R0 @ begin.R[0], p0 + R0 @ begin.p[0]), np.diag(START**2))
-    ideal = np.stack([np.append(each.t_lidar_mag, each.distortion.vector()) for each in sensors])
+    ideal = np.stack([each.vector() for each in sensors])
     given = ideal + sigma * rng.normal(size=ideal.shape)
     known = KnownSensors(
         names=tuple(each.sensor for each in sensors),

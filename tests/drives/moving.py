@@ -48,7 +48,7 @@ class MovingDrive:
     def error(self, sensor: int, found: FloatArray) -> FloatArray:
         """Return the error of (t, C row by row, H), shape (15,)."""
         known = self.sensors[sensor]
-        return np.asarray(found - np.concatenate([known.t_lidar_mag, known.distortion.vector()]))
+        return np.asarray(found - known.vector())
 
 
 def current(seed: int, seconds: FloatArray) -> FloatArray:

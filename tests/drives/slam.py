@@ -109,7 +109,7 @@ def calibrated(
     sigma = np.full(15, 1e-6) if sigma is None else sigma
     for each in sensors:
         error = np.zeros(15) if rng is None else sigma * rng.normal(size=15)
-        vector = np.concatenate([each.t_lidar_mag, each.distortion.vector()]) + error
+        vector = each.vector() + error
         entries.append(
             sensor(
                 each.sensor,

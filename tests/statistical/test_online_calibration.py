@@ -49,11 +49,6 @@ def thinned(truth: Trajectory) -> Trajectory:
     return Trajectory(truth.stamp_ns[rows], truth.R[rows], truth.p[rows], "map", "lidar")
 
 
-def vectors(sensors: KnownSensors) -> FloatArray:
-    """Return (t, C row by row, H) of sensors, shape (S, 15)."""
-    return np.hstack([sensors.t, sensors.distortion])
-
-
 def nees_of(
     drawn: DrawnDrive,
     poses: list[gtsam.Pose3],
@@ -61,7 +56,7 @@ def nees_of(
     sensors: KnownSensors,
     covariance: FloatArray,
 ) -> Nees:
-    wrong = drawn.calibration - vectors(sensors)
+    wrong = drawn.calibration - sensors.vectors()
     return Nees(
         mean_nees(poses, pose_covariance, drawn.poses), float(nees(wrong, covariance).mean())
     )
@@ -84,7 +79,7 @@ def one_drive(seed: int) -> Outcome:
     covariance = solved.calibration_covariance
     batch = nees_of(drawn, solved.poses, solved.pose_covariance, solved.drive.sensors, covariance)
     sigma = np.sqrt(np.einsum("sii->si", covariance))
-    apart = np.abs(vectors(last.sensors) - vectors(solved.drive.sensors)) / sigma
+    apart = np.abs(last.sensors.vectors() - solved.drive.sensors.vectors()) / sigma
     print(
         f"drive {seed}: NEES on line {on_line.poses:.2f} {on_line.calibration:.2f}, "
         f"batch {batch.poses:.2f} {batch.calibration:.2f}, apart {apart.max():.2f}",

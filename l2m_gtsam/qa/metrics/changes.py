@@ -127,14 +127,13 @@ def _why_not(new: SensorCalibration, old: SensorCalibration | None) -> str:
 
 def is_calibrated(sensor: SensorCalibration) -> bool:
     """Return whether anything is known of a sensor."""
-    values = np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])
+    values = sensor.vector()
     return bool(np.isfinite(values).all() and np.isfinite(np.diag(sensor.covariance)).any())
 
 
 def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float) -> ComparedSensor:
     """Return what has changed of one sensor."""
-    vectors = [np.concatenate([s.t_lidar_mag, s.distortion.vector()]) for s in (new, old)]
-    whole = CalibrationDifference(vectors[0] - vectors[1], new.covariance + old.covariance)
+    whole = CalibrationDifference(new.vector() - old.vector(), new.covariance + old.covariance)
     parts = differences(new, old, whole)
     tests = {part.value: each.tested(part.value) for part, each in parts.items()}
     tests["C"] = whole.part(slice(3, 12)).tested("C")

@@ -155,9 +155,8 @@ class PathNeighbourhood:
         seconds = NS * (drive.reading_ns - drive.stamp_ns[0])
         information = NoiseInformation(noise, seconds, weights)
         self.density = PathDensity(readings, prior.field, information)
-        sensors = drive.sensors
-        self.sensor = np.concatenate([sensors.t[0], sensors.distortion[0]])
-        covariance = sensors.covariance[0]
+        self.sensor = drive.sensors.vectors()[0]
+        covariance = drive.sensors.covariance[0]
         self._by_sensor = covariance_root(covariance, np.sqrt(np.diag(covariance)))
 
     @property

@@ -223,8 +223,7 @@ def other_ends(
 
 def ends_of(method: str, map_kind: str, drive: SiteDrive, found: MethodResult) -> Ends:
     """Return how far ends are from the truth."""
-    sensor = drive.sensor
-    truth = np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])
+    truth = drive.sensor.vector()
     t, C, H = (np.linalg.norm((found.vector - truth)[:, block], axis=1) for block in BLOCKS)
     return Ends(method, map_kind, t, C, H, found.seconds)
 

@@ -9,7 +9,7 @@ from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.calibration.one_key import solve_by_parts
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.parts_alone import ByParts
-from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.data import KnownSensor
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.qa.evaluate import measured
 from l2m_gtsam.qa.options import QaOptions
@@ -136,8 +136,7 @@ def judged_sensor(found: SensorCalibration, truth: KnownSensor, level: Level) ->
     covariance = found.covariance
     if not (np.isfinite(covariance).all() and np.isfinite(found.t_lidar_mag).all()):
         return JudgedSensor(level.value, None, None, None, None, excess)
-    true = vector_of(truth)
-    e = np.concatenate([found.t_lidar_mag, found.distortion.vector()]) - true
+    e = found.vector() - truth.vector()
     return JudgedSensor(
         level=level.value,
         distance_t=float(e[:3] @ np.linalg.solve(covariance[:3, :3], e[:3])),
@@ -152,7 +151,7 @@ def with_check(judged: JudgedSensor, alone: ByParts, truth: KnownSensor) -> Judg
     """Return what is said of a sensor, with what the check on parts says alone."""
     if judged.distance is None:
         return judged
-    e, P = alone.vector - vector_of(truth), alone.covariance
+    e, P = alone.vector - truth.vector(), alone.covariance
     checked = []
     for name, at in BLOCKS.items():
         ratios = alone.ratios[name]
@@ -167,8 +166,3 @@ def with_check(judged: JudgedSensor, alone: ByParts, truth: KnownSensor) -> Judg
             )
         )
     return replace(judged, alone=tuple(checked))
-
-
-def vector_of(sensor: KnownSensor) -> FloatArray:
-    """Return (t, C row by row, H), shape (15,)."""
-    return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])

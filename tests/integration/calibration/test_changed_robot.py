@@ -20,7 +20,6 @@ from l2m_gtsam.studies.slam_array.robot import SENSORS, assumed_sensors, robot_p
 from tests.drives.robot import map_by
 from tests.drives.shelves import Shelf, with_shelves
 
-FIRST = SENSORS[0]
 UPRIGHT = Shelf((0.4, -1.0, 0.5), (5.0, 3.0, 20.0), (0.04, 0.04, 1.0))
 OTHERS = (
     Shelf((4.3, -2.6, 0.4), (-15.0, 10.0, 0.0), (0.04, 1.0, 0.04)),

@@ -57,8 +57,7 @@ def calibrated(
 def deviations(sensor: SensorCalibration, places: FloatArray = PLACES) -> FloatArray:
     """Errors of (t, C, H) in sigmas; zero where the sigma is infinite."""
     truth = next(each for each in mounted(places) if each.sensor == sensor.sensor)
-    t, D = sensor.t_lidar_mag - truth.t_lidar_mag, sensor.distortion.vector()
-    error = np.concatenate([t, D - truth.distortion.vector()])
+    error = sensor.vector() - truth.vector()
     return np.asarray(error / np.sqrt(np.diag(sensor.covariance)))
 
 

@@ -11,11 +11,10 @@ from scipy.stats import chi2
 
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.cli.tables.calibration import model_note, model_tables
-from l2m_gtsam.data import FloatArray, ScalarSeries
+from l2m_gtsam.data import ScalarSeries
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
-    SensorCalibration,
     SensorStatus,
     Uncertainty,
 )
@@ -54,13 +53,9 @@ def calibrated(seed: int, strengths: tuple[float, ...], steel: bool = False) -> 
     return Calibrated(seed, moving_drive(seed, strengths), steel)
 
 
-def vector(sensor: SensorCalibration) -> FloatArray:
-    return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])
-
-
 def nees(drive: MovingDrive, result: CalibrationResult) -> list[float]:
     """Return the squared error in sigmas of (t, C, H) of each sensor; 15 are expected."""
-    errors = [drive.error(i, vector(each)) for i, each in enumerate(result.sensors)]
+    errors = [drive.error(i, each.vector()) for i, each in enumerate(result.sensors)]
     return [
         float(e @ np.linalg.solve(each.covariance, e))
         for e, each in zip(errors, result.sensors, strict=True)

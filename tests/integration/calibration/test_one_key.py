@@ -19,13 +19,9 @@ from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
 from tests.worlds.exact import DipoleWorld, dipole_world, drive, random_sensors
 
 
-def truth_vector(sensor: KnownSensor) -> FloatArray:
-    return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])
-
-
 def errors(solution: OneKeySolution, sensors: tuple[KnownSensor, ...]) -> FloatArray:
     found = [solution.estimate.vector(i) for i in range(len(sensors))]
-    return np.stack(found) - np.stack([truth_vector(s) for s in sensors])
+    return np.stack(found) - np.stack([s.vector() for s in sensors])
 
 
 @pytest.mark.parametrize("optimizer", list(Optimizer))

@@ -59,8 +59,7 @@ def rotation(R_mag_lidar: FloatArray) -> dict[str, Any]:
 
 
 def errors(sensor: SensorCalibration, truth: KnownSensor) -> FloatArray:
-    t, D = sensor.t_lidar_mag - truth.t_lidar_mag, sensor.distortion.vector()
-    return np.concatenate([t, D - truth.distortion.vector()])
+    return sensor.vector() - truth.vector()
 
 
 def drawn(seed: int) -> tuple[KnownSensor, dict[str, Any]]:

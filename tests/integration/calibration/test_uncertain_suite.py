@@ -64,9 +64,7 @@ def distances(solution: OneKeySolution) -> list[float]:
     """Return the squared distances of all fifteen parameters from the truth, a sensor each."""
     found = []
     for each in solution.solved:
-        truth = SENSORS[each.sensor]
-        vector = np.concatenate([truth.t_lidar_mag, truth.distortion.vector()])
-        e = solution.estimate.vector(each.sensor) - vector
+        e = solution.estimate.vector(each.sensor) - SENSORS[each.sensor].vector()
         found.append(float(e @ np.linalg.solve(each.covariance, e)))
     return found
 

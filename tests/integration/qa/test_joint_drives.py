@@ -11,13 +11,13 @@ from l2m_gtsam.batch.reports import REPORT_FILE, write_report
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import Calibrated, calibrate, calibrated
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
+from l2m_gtsam.data import Distortion, KnownSensor, Recording, SourceFile, Trajectory
 from l2m_gtsam.qa.evaluate import by_drive, evaluate
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
-from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
+from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
@@ -100,11 +100,6 @@ def good() -> Made:
     return made(monday(), tuesday())
 
 
-def vector(result: CalibrationResult, sensor: str) -> FloatArray:
-    found = result[sensor]
-    return np.concatenate([found.t_lidar_mag, found.distortion.vector()])
-
-
 def test_together_is_the_optimal_combination() -> None:
     """Of independent drives on an exact map: the mean weighted by the information of each.
 
@@ -118,9 +113,9 @@ def test_together_is_the_optimal_combination() -> None:
         weights = [np.linalg.inv(each[sensor].covariance) for each in (one, other)]
         covariance = np.linalg.inv(sum(weights, np.zeros((15, 15))))
         pairs = zip(weights, (one, other), strict=True)
-        mean = covariance @ sum((W @ vector(each, sensor) for W, each in pairs), np.zeros(15))
+        mean = covariance @ sum((W @ each[sensor].vector() for W, each in pairs), np.zeros(15))
         sigma = np.sqrt(np.diag(covariance))
-        np.testing.assert_allclose((vector(both, sensor) - mean) / sigma, 0, atol=0.1)
+        np.testing.assert_allclose((both[sensor].vector() - mean) / sigma, 0, atol=0.1)
         np.testing.assert_allclose(
             both[sensor].covariance / np.outer(sigma, sigma),
             covariance / np.outer(sigma, sigma),
@@ -159,7 +154,7 @@ def test_the_names_of_drives_do_not_matter_where_clocks_start_alike() -> None:
     assert [each.path for each in one.bags] != [each.path for each in other.bags]
     for sensor in NOMINAL:
         sigma = np.sqrt(np.diag(one[sensor].covariance))
-        away = (vector(one, sensor) - vector(other, sensor)) / sigma
+        away = (one[sensor].vector() - other[sensor].vector()) / sigma
         np.testing.assert_allclose(away, 0, atol=0.02)
 
 
@@ -177,7 +172,7 @@ def test_good_drives_pass_and_repeat(good: Made) -> None:
         assert found.drives.freedom == 15
         # 99.99 % of such squares: of three sensors one is beyond in 0.03 % of seeds
         assert found.drives.squared < 44.3
-        truth = np.concatenate([known.t_lidar_mag, known.distortion.vector()])
+        truth = known.vector()
         for each in found.drives.drives:
             ratio = (np.array(each.estimate) - truth) / np.array(each.sigma)
             assert np.abs(ratio).max() < 4.5

@@ -144,8 +144,7 @@ def test_a_calibration_is_refined_without_a_map() -> None:
     before, after, nees = [], [], []
     for truth, start in zip(sensors, rough.sensors, strict=True):
         refined = found.calibration[truth.sensor]
-        ideal = np.concatenate([truth.t_lidar_mag, truth.distortion.vector()])
-        error = np.concatenate([refined.t_lidar_mag, refined.distortion.vector()]) - ideal
+        error = refined.vector() - truth.vector()
         before.append(start.t_lidar_mag - truth.t_lidar_mag)
         after.append(error[:3])
         nees.append(error @ np.linalg.solve(refined.covariance, error))

@@ -173,7 +173,7 @@ def refined() -> tuple[OnLine, OnLine, FloatArray]:
         options = SlamOptions.model_validate({**QUICK, "calibration": use})
         drive, true = prepared_drive(6, laps(54, SMALL), own, known, options)
         found.append(OnLine.over(drive, true, options, ExploringOptions()))
-    truth = [np.append(each.t_lidar_mag, each.distortion.vector()) for each in own]
+    truth = [each.vector() for each in own]
     return found[0], found[1], np.array(truth)
 
 
@@ -196,7 +196,7 @@ def test_sigmas_of_refined_calibrations_cover_their_errors(
     resolve little of a sensor's field, as for the first, it is hardly learnt.)
     """
     last = refined[1].beliefs[-1]
-    error = np.hstack([last.sensors.t, last.sensors.distortion]) - refined[2]
+    error = last.sensors.vectors() - refined[2]
     known = last.calibration_covariance
     nees = np.mean([e @ np.linalg.solve(P, e) for e, P in zip(error, known, strict=True)])
     assert 4 < nees < 26

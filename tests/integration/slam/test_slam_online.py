@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import FloatArray
 from l2m_gtsam.progress import silent
-from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
@@ -17,11 +15,6 @@ from tests.worlds.exact import dipole_world
 
 LATE = 8  # key poses
 FAR = np.concatenate([np.full(3, 0.1), np.full(9, 0.1), np.full(3, 20.0)])
-
-
-def vectors(sensors: KnownSensors) -> FloatArray:
-    """Return (t, C row by row, H) of sensors, shape (S, 15)."""
-    return np.hstack([sensors.t, sensors.distortion])
 
 
 def test_a_calibration_that_is_far_off_converges_on_line() -> None:
@@ -34,10 +27,10 @@ def test_a_calibration_that_is_far_off_converges_on_line() -> None:
     last = followed_beliefs(drive, world, options.robust, free=True, section=50)[-1]
     batch = localise_drive(drive, world, options, silent)
     sigma = np.sqrt(np.einsum("sii->si", batch.calibration_covariance))
-    apart = np.abs(vectors(last.sensors) - vectors(batch.drive.sensors)) / sigma
+    apart = np.abs(last.sensors.vectors() - batch.drive.sensors.vectors()) / sigma
     assert apart.max() < 1.0
-    ideal = np.stack([np.append(each.t_lidar_mag, each.distortion.vector()) for each in sensors])
-    wrong = [np.abs(vectors(each) - ideal) for each in (drive.sensors, last.sensors)]
+    ideal = np.stack([each.vector() for each in sensors])
+    wrong = [np.abs(each.vectors() - ideal) for each in (drive.sensors, last.sensors)]
     # Each of the three kinds of numbers comes nearer to the truth, by far more than by chance.
     for columns in (slice(0, 3), slice(3, 12), slice(12, 15)):
         before, after = (np.sqrt(np.mean(each[:, columns] ** 2)) for each in wrong)
@@ -56,7 +49,7 @@ def test_sensors_may_be_heard_late(heard: str) -> None:
     drive = replace(drive, readings=readings[np.flatnonzero(~silent)])
     found = followed_beliefs(drive, dipole_world(1), options.robust, free=True, section=50)
     known = [each.sensors for each in found]
-    np.testing.assert_allclose(vectors(known[LATE - 1])[1], vectors(drive.sensors)[1], atol=1e-9)
-    ideal = np.stack([np.append(each.t_lidar_mag, each.distortion.vector()) for each in sensors])
-    before, after = (np.abs(vectors(each) - ideal)[1, 12:] for each in (drive.sensors, known[-1]))
+    np.testing.assert_allclose(known[LATE - 1].vectors()[1], drive.sensors.vectors()[1], atol=1e-9)
+    ideal = np.stack([each.vector() for each in sensors])
+    before, after = (np.abs(each.vectors() - ideal)[1, 12:] for each in (drive.sensors, known[-1]))
     assert np.linalg.norm(after) < 0.5 * np.linalg.norm(before)

@@ -48,8 +48,7 @@ def readings() -> Readings:
 
 def known(number_sigma: float = 0.0) -> KnownCalibration:
     rng = np.random.default_rng(3)
-    vector = np.concatenate([SENSOR.t_lidar_mag, SENSOR.distortion.vector()])
-    vector = np.append(vector + rng.normal(size=15) * SIGMA, 0.0)
+    vector = np.append(SENSOR.vector() + rng.normal(size=15) * SIGMA, 0.0)
     return KnownCalibration(vector, NOISE, np.full((1, 3), number_sigma))
 
 

@@ -24,16 +24,11 @@ def rank_test(open_: int) -> Determinacy:
     return determinacy(np.diag(strength), SCALES)
 
 
-def estimate(t_x: float = 0.0, C_xx: float = 1.0, noise: float = 0.1) -> Estimate:
+def estimate(t_x: float = 0.0, noise: float = 0.1) -> Estimate:
     distortion = np.tile(np.concatenate([np.eye(3).ravel(), np.zeros(3)]), (2, 1))
-    distortion[0, 0] = C_xx
     t = np.zeros((2, 3))
     t[0, 0] = t_x
     return Estimate(t, distortion, np.array([noise, 0.1]), np.zeros(2), np.zeros(2))
-
-
-def both_sound() -> dict[int, Determinacy]:
-    return {0: rank_test(0), 1: rank_test(0)}
 
 
 @dataclass(frozen=True)

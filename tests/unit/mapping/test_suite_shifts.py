@@ -43,7 +43,7 @@ def given(readings: Readings, sensors: list[KnownSensor]) -> FloatArray:
 
 
 def with_error(sensor: KnownSensor, k: int, step: float) -> KnownSensor:
-    vector = np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector(), [sensor.time_offset]])
+    vector = np.append(sensor.vector(), sensor.time_offset)
     vector[k] += step
     return KnownSensor(
         sensor.sensor, vector[:3], Distortion.from_vector(vector[3:15]), float(vector[15])

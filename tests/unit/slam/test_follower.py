@@ -81,7 +81,7 @@ def followed(drive: Drive, world: QueryableMap = WORLD, section: int = 200) -> l
 def apart(one: Belief, other: Belief) -> float:
     """Return the largest difference of two beliefs in sigmas of the second."""
     pose = gtsam.Pose3.Logmap(other.pose.between(one.pose))
-    sensors = [np.hstack([each.sensors.t, each.sensors.distortion]) for each in (one, other)]
+    sensors = [each.sensors.vectors() for each in (one, other)]
     off = np.concatenate([pose, (sensors[0] - sensors[1]).ravel()])
     return float(np.abs(off / np.sqrt(np.diag(other.covariance))).max())
 
@@ -143,7 +143,7 @@ def test_a_field_that_bends_does_not_lead_astray() -> None:
     )
     assert near.min() < 0.7
     for each in followed(given.drive, world):
-        found = np.hstack([each.sensors.t, each.sensors.distortion]) - given.calibration
+        found = each.sensors.vectors() - given.calibration
         for error, covariance in zip(found, each.calibration_covariance, strict=True):
             # Chi squared of 15 degrees of freedom passes 37.7 once in 1,000.
             assert error @ np.linalg.solve(covariance, error) < 37.7

@@ -87,7 +87,7 @@ def dense(step: Step) -> FloatArray:
     back, C = np.linalg.inv(J), np.linalg.cholesky(sensors.covariance[0])
     seconds = np.asarray(NS * drive.reading_ns, dtype=np.float64)
     noise = NoiseInformation(NOISE, seconds, np.ones(len(drive.readings)))
-    at = np.concatenate([sensors.t[0], sensors.distortion[0]])
+    at = sensors.vectors()[0]
 
     def cost(errors: FloatArray) -> float:
         off = back @ errors[: len(J)]

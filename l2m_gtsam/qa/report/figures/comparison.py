@@ -35,7 +35,7 @@ def drives_figure(sensor: SensorCalibration, found: Repeatability) -> Figure:
     """Draw place and offset by each drive less those of all together, with standard deviations."""
     figure = new_figure(3.6)
     parts = figure.subplots(2, 3, sharex=True, sharey="row")
-    whole = np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])
+    whole = sensor.vector()
     sigma = np.sqrt(np.diag(sensor.covariance))
     for axes_of, first, factor, name, unit in zip(
         parts, (0, 12), (1e3, 1.0), ("t", "H"), ("mm", "µT"), strict=True
