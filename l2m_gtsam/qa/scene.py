@@ -8,6 +8,7 @@ from l2m_gtsam.calibration.calibrate import Calibrated
 from l2m_gtsam.data import FloatArray, Recording, Trajectory
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.qa.evaluate import evidence_of
+from l2m_gtsam.qa.metrics.assemble import solved_sensors
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, Queryable, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import curves
 from l2m_gtsam.qa.metrics.plain import evenly
@@ -32,7 +33,7 @@ def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:
         The calibration, with what it rests on.
     """
     evidence = evidence_of(calibrated)
-    solved = [each for each in calibrated.result.sensors if each.residuals is not None]
+    solved = solved_sensors(calibrated.result)
     sensors = tuple(_sensor(each, evidence, calibrated.solver_map) for each in solved)
     places = np.concatenate([each.place for each in sensors])
     drives = [each.trajectory for each in recording.parts]

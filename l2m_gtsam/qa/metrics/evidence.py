@@ -84,7 +84,7 @@ def sensor_evidence(
     place = _places(drive.readings[own], sensor)
     # The last step of the solve may have carried a reading over the edge of the map.
     whole = field_map.query(place)
-    own, place, sample = own[whole.inside], place[whole.inside], _where_inside(whole)
+    own, place, sample = own[whole.inside], place[whole.inside], whole.select(whole.inside)
     readings, C = drive.readings[own], sensor.distortion.C
     R = readings.R_map_lidar
     # e = C R^T B(R t + p) + H - z, with covariance noise^2 I + C R^T V R C^T + the poses' share.
@@ -103,14 +103,6 @@ def sensor_evidence(
         map_share=map_share,
         pose_share=poses,
         white=np.asarray(np.einsum("nij,nj->ni", W, residual)),
-    )
-
-
-def _where_inside(sample: FieldSample) -> FieldSample:
-    """Return a sample without the points that the map has no data for."""
-    there = sample.inside
-    return FieldSample(
-        sample.field[there], sample.gradient[there], sample.variance[there], sample.inside[there]
     )
 
 
@@ -137,7 +129,4 @@ def _pose_share(
 
 def cross(v: FloatArray) -> FloatArray:
     """Return the matrices of the cross products with vectors, shape (N, 3), as (N, 3, 3)."""
-    zero = np.zeros(len(v))
-    x, y, z = v.T
-    entries = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
-    return np.asarray(entries.transpose(2, 0, 1))
+    return np.cross(np.eye(3), v[:, None])

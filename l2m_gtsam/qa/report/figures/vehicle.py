@@ -20,6 +20,7 @@ from l2m_gtsam.qa.report.svg import (
     MUTED,
     SMALL,
     ellipse,
+    lay_out,
     new_figure,
 )
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
@@ -64,7 +65,7 @@ def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: Viewpoint)
     axes.locator_params(nbins=6)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.18)
-    _lay_out(figure)
+    lay_out(figure)  # names are written where there is room
     _name(axes, found, view)
     for sensor in found:
         at = sensor.t_lidar_mag[list(view.axes)]
@@ -98,13 +99,6 @@ def _places(found: list[SensorCalibration], view: Viewpoint) -> FloatArray:
     room = np.array([[0.0, 0.0], [0.1, 0.1], [-0.1, -0.1]])
     own = [each.t_lidar_mag[list(view.axes)] for each in found]
     return np.vstack([room, *own])
-
-
-def _lay_out(figure: Figure) -> None:
-    """Place all axes for good: names are written where there is room."""
-    if (layout := figure.get_layout_engine()) is not None:
-        layout.execute(figure)
-    figure.set_layout_engine("none")
 
 
 def _name(axes: Axes, found: list[SensorCalibration], view: Viewpoint) -> None:
@@ -207,7 +201,7 @@ def calibration_figure(
     above.set_title("sensors on the vehicle, from above")
     side.set_title("from the side")
     above.legend(loc="lower left", bbox_to_anchor=(0, 1.08), ncols=2, fontsize="small")
-    _lay_out(figure)
+    lay_out(figure)
     for axes, view in ((above, TOP), (side, SIDE)):
         _name(axes, solved, view)
     return figure
