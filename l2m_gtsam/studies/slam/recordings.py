@@ -1,19 +1,20 @@
 """Recordings that others made, as drives with their truth, and odometry made of such poses."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FieldSeries, FloatArray, Recording, SourceFile, Trajectory
+from l2m_gtsam.data import FieldSeries, FloatArray, IntArray, Recording, SourceFile, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.options import Options
+from l2m_gtsam.storage.files import source_file
 
 SHIP = "model_ship_runs1-2.npz"
 ROBOT = "aalto_robot_runs1-4.npz"
@@ -70,23 +71,34 @@ def parts_of(site: str, known: Iterable[str]) -> tuple[str, int]:
 
 
 @contextmanager
-def readable(path: Path, what: str, name: str) -> Iterator[None]:
-    """Raise a ConfigError where a recording cannot be read inside: what of it, from which file."""
+def arrays_of(path: Path, what: str, name: str) -> Iterator[Mapping[str, Any]]:
+    """Give the arrays of a recording.
+
+    Raises
+    ------
+    ConfigError
+        They cannot be read, also inside: what of the recording, and from which file.
+    """
     try:
-        yield
+        with np.load(path, allow_pickle=False) as arrays:
+            yield arrays
     except (OSError, KeyError, ValueError) as error:
         raise ConfigError(
             f"{path}: no {what} can be read; set `data` to the folder of {name}"
         ) from error
 
 
-def drive_at(
-    path: Path, content: bytes, seconds: FloatArray, R: FloatArray, p: FloatArray, field: FloatArray
-) -> TrueDrive:
-    """Return a drive through poses at times, with a reading at each, from a file."""
-    stamps = np.round(SECOND * seconds).astype(np.int64)
-    source = SourceFile(str(path), sha256(content).hexdigest())
-    return TrueDrive(Trajectory(stamps, R, p, "map", "lidar"), field, source)
+def rotations(quaternion_wxyz: Any) -> FloatArray:
+    """Return rotations from quaternions with the scalar first, shape (N, 3, 3)."""
+    q = np.asarray(quaternion_wxyz, dtype=np.float64)
+    return np.asarray(Rotation.from_quat(q, scalar_first=True).as_matrix())
+
+
+def tracked(arrays: Mapping[str, Any], rows: IntArray) -> Trajectory:
+    """Return the poses in rows of a recording."""
+    stamps = np.round(SECOND * arrays["t"][rows]).astype(np.int64)
+    p = arrays["position"][rows].astype(np.float64)
+    return Trajectory(stamps, rotations(arrays["quaternion_wxyz"][rows]), p, "map", "lidar")
 
 
 def ship_run(path: Path, run: int) -> TrueDrive:
@@ -97,15 +109,13 @@ def ship_run(path: Path, run: int) -> TrueDrive:
     ConfigError
         There is no such file, or it has no such run.
     """
-    with readable(path, f"run {run} of the model ship", SHIP):
-        content = path.read_bytes()
-        with np.load(path, allow_pickle=False) as arrays:
-            p, field = arrays[f"position_{run}"], arrays[f"field_{run}"]
-            quaternion, period = arrays[f"quaternion_wxyz_{run}"], float(arrays[f"period_{run}"])
-        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    return drive_at(
-        path, content, period * np.arange(len(p), dtype=np.float64), R, p, EARTH_UT * field
-    )
+    with arrays_of(path, f"run {run} of the model ship", SHIP) as arrays:
+        p, field = arrays[f"position_{run}"], arrays[f"field_{run}"]
+        period = float(arrays[f"period_{run}"])
+        R = rotations(arrays[f"quaternion_wxyz_{run}"])
+    stamps = np.round(SECOND * (period * np.arange(len(p)))).astype(np.int64)
+    truth = Trajectory(stamps, R, p, "map", "lidar")
+    return TrueDrive(truth, EARTH_UT * field, source_file(path))
 
 
 def robot_run(path: Path, run: int) -> TrueDrive:
@@ -116,16 +126,11 @@ def robot_run(path: Path, run: int) -> TrueDrive:
     ConfigError
         There is no such file, or it has no such pass.
     """
-    with readable(path, f"pass {run} of the robot", ROBOT):
-        content = path.read_bytes()
-        with np.load(path, allow_pickle=False) as arrays:
-            rows = np.flatnonzero((arrays["run"] == run) & arrays["ok"])[::EVERY]
-            seconds, p = arrays["t"][rows], arrays["position"][rows].astype(np.float64)
-            quaternion = arrays["quaternion_wxyz"][rows].astype(np.float64)
-            field = arrays["mag_body"][rows, 0].astype(np.float64)
-            lever = arrays["sensor_positions_body"][0].astype(np.float64)
-        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    return drive_at(path, content, seconds, R, p + R @ lever, field)
+    with arrays_of(path, f"pass {run} of the robot", ROBOT) as arrays:
+        rows = np.flatnonzero((arrays["run"] == run) & arrays["ok"])[::EVERY]
+        truth, field = tracked(arrays, rows), arrays["mag_body"][rows, 0].astype(np.float64)
+        lever = arrays["sensor_positions_body"][0].astype(np.float64)
+    return TrueDrive(replace(truth, p=truth.p + truth.R @ lever), field, source_file(path))
 
 
 def handheld_run(path: Path, run: int) -> TrueDrive:
@@ -136,15 +141,10 @@ def handheld_run(path: Path, run: int) -> TrueDrive:
     ConfigError
         There is no such file, or it has no such run.
     """
-    with readable(path, f"run {run} of the sensor in the hand", HANDHELD):
-        content = path.read_bytes()
-        with np.load(path, allow_pickle=False) as arrays:
-            rows = np.flatnonzero(arrays["run"] == run)[::EVERY_HANDHELD]
-            seconds, p = arrays["t"][rows], arrays["position"][rows].astype(np.float64)
-            quaternion = arrays["quaternion_wxyz"][rows].astype(np.float64)
-            field = arrays["mag_uT"][rows].astype(np.float64)
-        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    return drive_at(path, content, seconds, R, p, field)
+    with arrays_of(path, f"run {run} of the sensor in the hand", HANDHELD) as arrays:
+        rows = np.flatnonzero(arrays["run"] == run)[::EVERY_HANDHELD]
+        truth, field = tracked(arrays, rows), arrays["mag_uT"][rows].astype(np.float64)
+    return TrueDrive(truth, field, source_file(path))
 
 
 class Form(StrEnum):

@@ -7,11 +7,9 @@ poses are known. Odometry is made of these.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import (
@@ -21,7 +19,6 @@ from l2m_gtsam.data import (
     IntArray,
     KnownSensor,
     Recording,
-    SourceFile,
     Trajectory,
 )
 from l2m_gtsam.errors import ConfigError
@@ -32,8 +29,9 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.simulate.odometry import OdometryDriftOptions, drifting
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
 from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.studies.slam.methods import given_sensors
-from l2m_gtsam.studies.slam.recordings import ROBOT, readable
+from l2m_gtsam.studies.slam.recordings import ROBOT, arrays_of, rotations
 from l2m_gtsam.studies.slam_array.odometry import slipping, slipping_on_floor, walked
 from l2m_gtsam.studies.slam_array.robot import RUNS, other_passes, robot_pass
 
@@ -117,11 +115,9 @@ def robot(folder: Path, run: int) -> DriveInMap:
     ConfigError
         There is no such file, or it has no such pass.
     """
-    path = folder / ROBOT
-    with readable(path, f"pass {run} of the robot", ROBOT):
-        drive = robot_pass(folder, run, EVERY)
+    drive = robot_pass(folder, run, EVERY)
     if run not in RUNS:
-        raise ConfigError(f"{path}: pass {run} is not one of {RUNS[0]} to {RUNS[-1]}")
+        raise ConfigError(f"{folder / ROBOT}: pass {run} is not one of {RUNS[0]} to {RUNS[-1]}")
     others = other_passes(folder, run)
     common = {"key_poses": {"distance_m": 0.1, "readings": 1}, "calibration": "refined"}
     options = {
@@ -140,16 +136,12 @@ def array(folder: Path, run: int) -> DriveInMap:
         There is no such file, or it has no such run beyond those that are mapped.
     """
     path = folder / ARRAY
-    with readable(path, f"run {run} of the array", ARRAY):
-        content = path.read_bytes()
-        with np.load(path, allow_pickle=False) as arrays:
-            p = arrays["position"].astype(np.float64)
-            quaternion = arrays["quaternion_wxyz"].astype(np.float64)
-            field, t = arrays["mag_uT"].astype(np.float64), arrays["sensor_positions_body"]
-        if run in MAPPED or run >= len(p):
-            raise ConfigError(f"{path}: run {run} is not one of 5 to {len(p) - 1}")
-    turns = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True).as_matrix()
-    R = turns.reshape(*p.shape[:2], 3, 3)
+    with arrays_of(path, f"run {run} of the array", ARRAY) as arrays:
+        p, quaternion = arrays["position"].astype(np.float64), arrays["quaternion_wxyz"]
+        field, t = arrays["mag_uT"].astype(np.float64), arrays["sensor_positions_body"]
+    if run in MAPPED or run >= len(p):
+        raise ConfigError(f"{path}: run {run} is not one of 5 to {len(p) - 1}")
+    R = rotations(quaternion.reshape(-1, 4)).reshape(*p.shape[:2], 3, 3)
     mapped = list(MAPPED)
     points = np.einsum("rnij,sj->rnsi", R[mapped], t) + p[mapped][:, :, None]
     there = np.einsum("rnij,rnsj->rnsi", R[mapped], field[mapped])
@@ -162,7 +154,7 @@ def array(folder: Path, run: int) -> DriveInMap:
     )
     rows = np.arange(0, len(stamps), EVERY)
     poses = Trajectory(stamps[rows], R[run, rows], p[run, rows], "map", "lidar")
-    recording = Recording(poses, series, SourceFile(str(path), sha256(content).hexdigest()))
+    recording = Recording(poses, series, source_file(path))
     known = [
         KnownSensor(name, at, Distortion.identity()) for name, at in zip(names, t, strict=True)
     ]

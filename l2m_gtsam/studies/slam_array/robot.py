@@ -4,16 +4,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import Distortion, FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
+from l2m_gtsam.data import Distortion, FieldSeries, KnownSensor, Recording, SourceFile
 from l2m_gtsam.mapping.map_building import map_recordings
 from l2m_gtsam.mapping.options import MappingOptions, SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.studies.slam.recordings import ROBOT
+from l2m_gtsam.studies.slam.recordings import ROBOT, arrays_of, tracked
 
 SENSORS = ("invensense", "trivisio", "nexus")
 TRIVISIO_UT = 46.0  # its readings are in units of about so many microtesla
@@ -21,17 +20,19 @@ RUNS = (1, 2, 3, 4)
 
 
 def robot_pass(folder: Path, run: int, every: int = 1) -> Recording:
-    """Return a pass with its captured poses, each ``every``-th of those at 50 Hz."""
-    with np.load(folder / ROBOT, allow_pickle=False) as arrays:
-        of = (arrays["run"] == run) & arrays["ok"]
-        seconds, p, q = (arrays[name][of] for name in ("t", "position", "quaternion_wxyz"))
-        field = arrays["mag_body"][of].astype(np.float64)
+    """Return a pass with its captured poses, each ``every``-th of those at 50 Hz.
+
+    Raises
+    ------
+    ConfigError
+        There is no such file, or it has no such pass.
+    """
+    with arrays_of(folder / ROBOT, f"pass {run} of the robot", ROBOT) as arrays:
+        rows = np.flatnonzero((arrays["run"] == run) & arrays["ok"])
+        poses, field = tracked(arrays, rows), arrays["mag_body"][rows].astype(np.float64)
     field[:, 1] *= TRIVISIO_UT
-    stamps = np.round(1e9 * seconds).astype(np.int64)
-    R = Rotation.from_quat(q.astype(np.float64), scalar_first=True).as_matrix()
-    poses = Trajectory(stamps, R, p.astype(np.float64), "map", "lidar")
     series = tuple(
-        FieldSeries(name, f"/{name}", "lidar", stamps, field[:, i])
+        FieldSeries(name, f"/{name}", "lidar", poses.stamp_ns, field[:, i])
         for i, name in enumerate(SENSORS)
     )
     return Recording(poses[np.arange(0, len(poses), every)], series, SourceFile(f"run{run}", ""))
