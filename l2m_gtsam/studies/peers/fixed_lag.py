@@ -4,6 +4,8 @@ Field, noise and steps are those of :mod:`l2m_gtsam.studies.peers.reduced_rank_e
 smoothed over the lag and marginalised then; the weights of the field stay.
 """
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from pydantic import Field
@@ -13,7 +15,7 @@ from l2m_factors.field_map import Jacobians
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.maps.potential import PotentialBasis
 from l2m_gtsam.options import Options
-from l2m_gtsam.studies.peers.reduced_rank_ekf import FilteredPath, ReducedRankEkfOptions
+from l2m_gtsam.studies.peers.reduced_rank_ekf import ReducedRankEkfOptions
 
 WEIGHTS = gtsam.symbol("w", 0)
 SURE = 1e-4  # metres and rad: the start is exact
@@ -36,8 +38,8 @@ def fixed_lag_slam(
     box: FloatArray,
     model: ReducedRankEkfOptions,
     options: FixedLagOptions,
-) -> FilteredPath:
-    """Return the smoother's estimate of each pose when it is made.
+) -> Trajectory:
+    """Return the smoother's estimate of each pose, with its covariance, when it is made.
 
     Parameters
     ----------
@@ -74,10 +76,11 @@ def fixed_lag_slam(
         smoother.update(graph, values, {X(k): seconds[k], WEIGHTS: seconds[k]})
         found.append(smoother.calculateEstimatePose3(X(k)))
         covariance.append(smoother.marginalCovariance(X(k)))
-    return FilteredPath(
-        np.stack([each.rotation().matrix() for each in found]),
-        np.stack([each.translation() for each in found]),
-        np.stack(covariance),
+    return replace(
+        odometry,
+        R=np.stack([each.rotation().matrix() for each in found]),
+        p=np.stack([each.translation() for each in found]),
+        covariance=np.stack(covariance),
     )
 
 

@@ -12,6 +12,9 @@ attitude, so that calibrated sensors of any orientation take part alike.
 In both, where few particles carry the weight, they are drawn anew.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
@@ -21,7 +24,7 @@ from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.options import Options
 from l2m_gtsam.slam.drift import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
-from l2m_gtsam.studies.peers.reduced_rank_ekf import POSE, FilteredPath, ReducedRankEkfOptions
+from l2m_gtsam.studies.peers.reduced_rank_ekf import POSE, ReducedRankEkfOptions
 
 AXES = 3
 
@@ -42,7 +45,7 @@ def particle_slam(
     model: ReducedRankEkfOptions,
     options: ParticleSlamOptions,
     seed: int,
-) -> FilteredPath:
+) -> Trajectory:
     """Return mean and covariance of the particles at each reading, from the readings until then.
 
     Parameters
@@ -92,8 +95,7 @@ def particle_slam(
         if 1 / np.sum(shares**2) < options.effective * count:
             drawn = systematic(shares, rng)
             R, p, weights, P, logs = R[drawn], p[drawn], weights[drawn], P[drawn], np.zeros(count)
-    rotations, places, covariance = (np.stack(each) for each in zip(*found, strict=True))
-    return FilteredPath(rotations, places, covariance)
+    return path_of(odometry, found)
 
 
 def moments(
@@ -115,6 +117,14 @@ def moments(
     turn = Rotation.from_matrix(mean_R.T @ R).as_rotvec()
     off = np.hstack([turn, (p - mean_p) @ mean_R])
     return mean_R, mean_p, (off * shares[:, None]).T @ off + own
+
+
+def path_of(
+    odometry: Trajectory, found: Sequence[tuple[FloatArray, FloatArray, FloatArray]]
+) -> Trajectory:
+    """Return rotations, positions and covariances at the times of odometry."""
+    R, p, covariance = (np.stack(each) for each in zip(*found, strict=True))
+    return replace(odometry, R=R, p=p, covariance=covariance)
 
 
 def systematic(shares: FloatArray, rng: np.random.Generator) -> IntArray:
@@ -143,7 +153,7 @@ def map_particles(
     drift: DriftOptions,
     options: MapParticlesOptions,
     seed: int,
-) -> FilteredPath:
+) -> Trajectory:
     """Return mean and covariance of the particles at each pose, from the readings until then.
 
     Parameters
@@ -192,5 +202,4 @@ def map_particles(
         if 1 / np.sum(shares**2) < options.effective * count:
             drawn = systematic(shares, rng)
             R, p, logs = R[drawn], p[drawn], np.zeros(count)
-    rotations, places, covariances = (np.stack(each) for each in zip(*found, strict=True))
-    return FilteredPath(rotations, places, covariances)
+    return path_of(odometry, found)

@@ -5,12 +5,13 @@ An extended Kalman filter of position, heading and the weights of a potential fi
 of the world, and each reading updates pose and weights together. Not iterated, no smoothing.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from l2m_factors import skew
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
 from l2m_gtsam.options import Options
@@ -43,27 +44,10 @@ class ReducedRankEkfOptions(Options):
         return PotentialBasis.over(low, high, self.prior, self.functions)
 
 
-@dataclass(frozen=True)
-class FilteredPath:
-    """What the filter says at each reading, from the readings until then.
-
-    Attributes
-    ----------
-    R, p
-        Poses, shapes (N, 3, 3) and (N, 3), metres.
-    covariance
-        Of a right perturbation, rotation (rad) before translation (m), shape (N, 6, 6).
-    """
-
-    R: FloatArray
-    p: FloatArray
-    covariance: FloatArray
-
-
 def reduced_rank_ekf(
     odometry: Trajectory, field: FloatArray, box: FloatArray, options: ReducedRankEkfOptions
-) -> FilteredPath:
-    """Return the filter's poses.
+) -> Trajectory:
+    """Return the filter's poses with their covariances, each from the readings until then.
 
     Parameters
     ----------
@@ -93,7 +77,7 @@ def reduced_rank_ekf(
         at, axes, P = p[-1] + step, turned @ R[-1], P + Q
         features = basis.features(at[None])[0]
         predicted, gradient = features @ weights, basis.slopes(at[None])[0] @ weights
-        H = np.hstack([gradient, cross_matrix(predicted), features])
+        H = np.hstack([gradient, skew(predicted[None])[0], features])
         S = H @ P @ H.T + noise
         K = np.linalg.solve(S, H @ P).T
         change = K @ (axes @ reading - predicted)
@@ -103,7 +87,10 @@ def reduced_rank_ekf(
         p.append(at + change[:3])
         R.append(Rotation.from_rotvec(change[3:POSE]).as_matrix() @ axes)
         covariance.append(P[:POSE, :POSE])
-    return FilteredPath(np.stack(R), np.stack(p), in_body(np.stack(covariance), np.stack(R)))
+    rotations = np.stack(R)
+    return replace(
+        odometry, R=rotations, p=np.stack(p), covariance=in_body(np.stack(covariance), rotations)
+    )
 
 
 def in_body(covariance: FloatArray, R: FloatArray) -> FloatArray:
@@ -111,8 +98,3 @@ def in_body(covariance: FloatArray, R: FloatArray) -> FloatArray:
     turn = np.zeros((len(R), POSE, POSE))
     turn[:, :3, 3:] = turn[:, 3:, :3] = R.transpose(0, 2, 1)
     return np.asarray(turn @ covariance @ turn.transpose(0, 2, 1))
-
-
-def cross_matrix(v: FloatArray) -> FloatArray:
-    """Return the matrix of the vector product with v, shape (3, 3)."""
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

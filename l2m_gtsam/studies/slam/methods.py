@@ -29,7 +29,6 @@ from l2m_gtsam.studies.peers.fixed_lag import FixedLagOptions, fixed_lag_slam
 from l2m_gtsam.studies.peers.particle_filters import ParticleSlamOptions, particle_slam
 from l2m_gtsam.studies.peers.reduced_rank_ekf import (
     POSE,
-    FilteredPath,
     ReducedRankEkfOptions,
     reduced_rank_ekf,
 )
@@ -111,14 +110,12 @@ def odometry_row(drive: TrueDrive, odometry: Trajectory, rows: IntArray) -> Meth
 
 
 def peer_row(
-    drive: TrueDrive, rows: IntArray, method: Callable[[FloatArray], FilteredPath]
+    drive: TrueDrive, rows: IntArray, method: Callable[[FloatArray], Trajectory]
 ) -> MethodRow:
     """Return those of a peer, whose box is about the true path."""
     box = np.stack([drive.truth.p.min(axis=0), drive.truth.p.max(axis=0)])
     took = measured(lambda: method(box))
-    found, stamps = took.result, drive.truth.stamp_ns
-    estimate = Trajectory(stamps, found.R, found.p, "map", "lidar", covariance=found.covariance)
-    return MethodRow.of(took.of(estimate[rows]), drive.truth)
+    return MethodRow.of(took.of(took.result[rows]), drive.truth)
 
 
 def online_row(
@@ -320,7 +317,7 @@ def computed(options: SlamStudyOptions, key: str, drive: TrueDrive) -> SlamCell:
     stated = stated_drift(drive.truth, recipe, Form(form))
     ours, rows = our_row(drive, odometry, stated, options.noise_ut)
     model, field = options.filter, drive.field
-    peers: tuple[Callable[[FloatArray], FilteredPath], ...] = (
+    peers: tuple[Callable[[FloatArray], Trajectory], ...] = (
         lambda box: reduced_rank_ekf(odometry, field, box, model),
         lambda box: particle_slam(odometry, field, box, model, options.particles, int(seed)),
         lambda box: fixed_lag_slam(odometry, field, box, model, options.fixed_lag),

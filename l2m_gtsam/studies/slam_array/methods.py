@@ -149,7 +149,7 @@ def particles(
     """Return the poses of the particle filter, a step each ``APART_M`` of path."""
     rows = apart(odometry.p)
     steps = odometry[rows]
-    found = map_particles(
+    return map_particles(
         steps,
         strengths(drive.recording, drive.calibration, steps.stamp_ns),
         np.stack([each.t_lidar_mag for each in drive.calibration.sensors]),
@@ -158,7 +158,6 @@ def particles(
         options.particles,
         seed,
     )
-    return Trajectory(steps.stamp_ns, found.R, found.p, "map", "lidar", covariance=found.covariance)
 
 
 def apart(p: FloatArray) -> IntArray:
