@@ -19,7 +19,7 @@ from l2m_gtsam.simulate.drive import drive
 from l2m_gtsam.simulate.recorder import Vehicle, record
 from l2m_gtsam.simulate.route import calibration_route
 from l2m_gtsam.simulate.sensors import random_array
-from l2m_gtsam.studies.measured import measured
+from l2m_gtsam.studies.measured import MeasuredWork, measured
 from l2m_gtsam.studies.methods import numeric_least_squares
 from l2m_gtsam.studies.scaling.measurements import Measurement, Quantity, ScalingOptions, TimedTask
 from l2m_gtsam.studies.site import SurveyedSite, around
@@ -145,23 +145,7 @@ def middle(survey: TrainingSet, most: int) -> TrainingSet:
     return survey[np.sort(np.argsort(away, kind="stable")[:most])]
 
 
-@dataclass(frozen=True)
-class Taken:
-    """What a piece of work took.
-
-    Attributes
-    ----------
-    seconds
-        Processor time of this process.
-    peak_mib
-        By how much its memory grew at most, MiB; absent where the system does not report it.
-    """
-
-    seconds: float
-    peak_mib: float | None
-
-
-def taken(work: Callable[[], object], rounds: int, long: float) -> Taken:
+def taken(work: Callable[[], object], rounds: int, long: float) -> MeasuredWork[None]:
     """Return the least time of some rounds, and the peak of memory in the first.
 
     Parameters
@@ -171,13 +155,13 @@ def taken(work: Callable[[], object], rounds: int, long: float) -> Taken:
     long
         Work that takes so many seconds is not repeated.
     """
-    first = measured(work)
+    first = measured(work).of(None)
     seconds = first.seconds
     for _ in range(rounds - 1):
         if seconds >= long:
             break
         seconds = min(seconds, timed(work))
-    return Taken(seconds, first.peak_mib)
+    return replace(first, seconds=seconds)
 
 
 def timed(work: Callable[[], object]) -> float:

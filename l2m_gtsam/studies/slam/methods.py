@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
 
 import numpy as np
 from pydantic import Field
@@ -33,17 +32,10 @@ from l2m_gtsam.studies.peers.reduced_rank_ekf import (
     reduced_rank_ekf,
 )
 from l2m_gtsam.studies.slam.recordings import (
-    HANDHELD,
-    ROBOT,
-    SHIP,
     DriftRecipe,
     Form,
     TrueDrive,
     drifted,
-    handheld_run,
-    parts_of,
-    robot_run,
-    ship_run,
 )
 from l2m_gtsam.studies.statistics import LEVEL, nees
 
@@ -277,36 +269,6 @@ class SlamCell:
     fixed_lag: MethodRow
     online: MethodRow
     ours: MethodRow
-
-
-def cell_keys(options: SlamStudyOptions) -> tuple[str, ...]:
-    """Return all cells."""
-    return tuple(
-        f"{site}-{kind}-{form}-{options.seed + number}"
-        for site in options.recordings
-        for kind in DriftKind
-        for form in Form
-        for number in range(options.seeds)
-    )
-
-
-def site_of(key: str) -> str:
-    """Return the recording of a cell."""
-    return "-".join(key.split("-")[:2])
-
-
-READERS = {
-    "ship": (ship_run, SHIP),
-    "hand": (handheld_run, HANDHELD),
-    "robot": (robot_run, ROBOT),
-}
-
-
-def read_drive(options: SlamStudyOptions, site: str) -> TrueDrive:
-    """Return a recording with its true poses."""
-    carrier, run = parts_of(site, READERS)
-    read, name = READERS[carrier]
-    return read(Path(options.data) / name, run)
 
 
 def computed(options: SlamStudyOptions, key: str, drive: TrueDrive) -> SlamCell:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -9,18 +10,31 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.studies.slam.methods import (
+    DriftKind,
     MethodRow,
     SlamCell,
     SlamStudyOptions,
-    cell_keys,
     computed,
-    read_drive,
-    site_of,
 )
-from l2m_gtsam.studies.slam.recordings import TrueDrive
+from l2m_gtsam.studies.slam.recordings import (
+    HANDHELD,
+    ROBOT,
+    SHIP,
+    Form,
+    TrueDrive,
+    handheld_run,
+    parts_of,
+    robot_run,
+    ship_run,
+)
 from l2m_gtsam.studies.study import Study
 
 Cell = TypeVar("Cell")
+READERS = {
+    "ship": (ship_run, SHIP),
+    "hand": (handheld_run, HANDHELD),
+    "robot": (robot_run, ROBOT),
+}
 METHODS = {
     "odometry": "odometry",
     "ekf": "reduced-rank filter",
@@ -113,15 +127,23 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
 
     def keys(self, options: SlamStudyOptions) -> tuple[str, ...]:
         """Return one cell for each recording, drift, form and seed."""
-        return cell_keys(options)
+        return tuple(
+            f"{site}-{kind}-{form}-{options.seed + number}"
+            for site in options.recordings
+            for kind in DriftKind
+            for form in Form
+            for number in range(options.seeds)
+        )
 
     def site(self, options: SlamStudyOptions, key: str) -> str:
         """Return the recording."""
-        return site_of(key)
+        return "-".join(key.split("-")[:2])
 
     def prepare(self, options: SlamStudyOptions, site: str) -> TrueDrive:
-        """Return the recording."""
-        return read_drive(options, site)
+        """Return the recording with its true poses."""
+        carrier, run = parts_of(site, READERS)
+        read, name = READERS[carrier]
+        return read(Path(options.data) / name, run)
 
     def compute(self, options: SlamStudyOptions, key: str, shared: TrueDrive) -> SlamCell:
         """Run all methods on one odometry."""
@@ -213,12 +235,7 @@ def row_of(key: str, cells: list[SlamCell]) -> SlamRow:
         form=form,
         path_m=cells[0].path_m,
         key_poses=cells[0].key_poses,
-        odometry=figures_of(before, before),
-        ekf=figures_of([each.ekf for each in cells], before),
-        particles=figures_of([each.particles for each in cells], before),
-        fixed_lag=figures_of([each.fixed_lag for each in cells], before),
-        online=figures_of([each.online for each in cells], before),
-        ours=figures_of([each.ours for each in cells], before),
+        **{name: figures_of([getattr(cell, name) for cell in cells], before) for name in METHODS},
     )
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from pydantic import Field
@@ -19,8 +18,7 @@ from l2m_gtsam.studies.measured import measured
 from l2m_gtsam.studies.peers.exact_loops import closed_by_exact_loops
 from l2m_gtsam.studies.peers.particle_filters import MapParticlesOptions, map_particles
 from l2m_gtsam.studies.slam.methods import MethodRow, followed, rms
-from l2m_gtsam.studies.slam.recordings import parts_of
-from l2m_gtsam.studies.slam_array.places import PLACES, Drift, DriveInMap, strengths
+from l2m_gtsam.studies.slam_array.places import Drift, DriveInMap, strengths
 
 RECORDINGS = (
     *(f"robot-{run}" for run in (1, 2, 3, 4)),
@@ -75,22 +73,6 @@ class SlamArrayCell:
     ours: MethodRow
     near_loops_m: float
     wide_loops_m: float
-
-
-def cell_keys(options: SlamArrayOptions) -> tuple[str, ...]:
-    """Return all cells."""
-    return tuple(
-        f"{site}-{drift}-{options.seed + number}"
-        for site in options.recordings
-        for drift in Drift
-        for number in range(options.seeds)
-    )
-
-
-def read_place(options: SlamArrayOptions, site: str) -> DriveInMap:
-    """Return a drive with its map."""
-    place, number = parts_of(site, PLACES)
-    return PLACES[place](Path(options.data), number)
 
 
 def computed(options: SlamArrayOptions, key: str, drive: DriveInMap) -> SlamArrayCell:

@@ -2,23 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from l2m_gtsam.studies.slam.methods import MethodRow, site_of
+from l2m_gtsam.studies.slam.methods import MethodRow
+from l2m_gtsam.studies.slam.recordings import parts_of
 from l2m_gtsam.studies.slam.study import WIDTH, MethodFigures, draw_bars, figures_of, seeds_together
 from l2m_gtsam.studies.slam_array.methods import (
     NEAR_M,
     WIDE_M,
     SlamArrayCell,
     SlamArrayOptions,
-    cell_keys,
     computed,
-    read_place,
 )
-from l2m_gtsam.studies.slam_array.places import DriveInMap
+from l2m_gtsam.studies.slam_array.places import PLACES, Drift, DriveInMap
 from l2m_gtsam.studies.study import Study
 
 METHODS = {
@@ -101,15 +101,21 @@ class SlamArrayStudy(Study[SlamArrayOptions, SlamArrayCell, SlamArraySummary]):
 
     def keys(self, options: SlamArrayOptions) -> tuple[str, ...]:
         """Return one cell for each recording, drift and seed."""
-        return cell_keys(options)
+        return tuple(
+            f"{site}-{drift}-{options.seed + number}"
+            for site in options.recordings
+            for drift in Drift
+            for number in range(options.seeds)
+        )
 
     def site(self, options: SlamArrayOptions, key: str) -> str:
         """Return the recording."""
-        return site_of(key)
+        return "-".join(key.split("-")[:2])
 
     def prepare(self, options: SlamArrayOptions, site: str) -> DriveInMap:
         """Return the drive and its map."""
-        return read_place(options, site)
+        place, number = parts_of(site, PLACES)
+        return PLACES[place](Path(options.data), number)
 
     def compute(self, options: SlamArrayOptions, key: str, shared: DriveInMap) -> SlamArrayCell:
         """Run all methods on one odometry."""
@@ -176,12 +182,7 @@ def row_of(key: str, cells: list[SlamArrayCell]) -> SlamArrayRow:
         kind=kind,
         path_m=cells[0].path_m,
         sensors=cells[0].sensors,
-        odometry=figures_of(before, before),
-        particles=figures_of([each.particles for each in cells], before),
-        map_online=figures_of([each.map_online for each in cells], before),
-        map_ours=figures_of([each.map_ours for each in cells], before),
-        online=figures_of([each.online for each in cells], before),
-        ours=figures_of([each.ours for each in cells], before),
+        **{name: figures_of([getattr(cell, name) for cell in cells], before) for name in METHODS},
         near_loops=DriftLeft.of([each.near_loops_m for each in cells], before),
         wide_loops=DriftLeft.of([each.wide_loops_m for each in cells], before),
     )
