@@ -10,6 +10,7 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions, alternate, start_es
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings, reading_graph
 from l2m_gtsam.calibration.forecast import stated_at
+from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.optimise import Optimizer, optimise
 from l2m_gtsam.calibration.view import QueryableMap, StandIns, observe
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings
@@ -25,6 +26,7 @@ from l2m_gtsam.solve.closed_form import (
 )
 from l2m_gtsam.solve.noise import reading_covariance
 
+UNKNOWNS = 15  # of a sensor: t, C and H
 PUBLISHED = ClosedFormOptions(weighting=Weighting.PAPER)
 SETTLED_M = 1e-5
 
@@ -87,6 +89,28 @@ def published(
             break
     none = np.zeros(1)
     return Estimate(t[None], found.vector()[None], np.ones(1), none, none)
+
+
+def as_published(readings: Readings, field_map: QueryableMap, t_start: FloatArray) -> FloatArray:
+    """Return t, C row by row and H where the paper's algorithm ends, (15,); NaN off the map."""
+    end = published(readings, field_map, t_start)
+    return np.full(UNKNOWNS, np.nan) if end is None else end.vector(0)
+
+
+def one_key_from(
+    readings: Readings, field_map: QueryableMap, places: FloatArray, options: OneKeyOptions
+) -> FloatArray:
+    """Return t, C row by row and H of one sensor by our solve from each place, shape (N, 15).
+
+    Each by itself, as for a vehicle with one sensor; NaN from a place that is NaN, and where no
+    solution is found.
+    """
+    ends = np.full((len(places), UNKNOWNS), np.nan)
+    for row in np.flatnonzero(np.isfinite(places).all(axis=1)):
+        solution = solve_one_key(readings, field_map, places[row][None], options)
+        if solution.solved:
+            ends[row] = solution.estimate.vector(0)
+    return ends
 
 
 def cramer_rao(
@@ -207,7 +231,6 @@ def closed_form(
     return fit_distortion(b_lidar, readings.field, weights, options.closed_form).distortion
 
 
-UNKNOWNS = 15  # of a sensor: t, C and H
 MOST_STEPS = 30
 
 

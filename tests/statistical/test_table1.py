@@ -10,6 +10,7 @@ from pydantic import TypeAdapter
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.route import RouteShape
+from l2m_gtsam.studies.methods import as_published
 from l2m_gtsam.studies.site import random_drive
 from l2m_gtsam.studies.table1.cells import (
     Ends,
@@ -19,7 +20,7 @@ from l2m_gtsam.studies.table1.cells import (
     compute,
     prepare,
 )
-from l2m_gtsam.studies.table1.methods import HARMONIC, NAIVE, OTHERS, OURS, SLIDING, as_published
+from l2m_gtsam.studies.table1.methods import HARMONIC, NAIVE, OTHERS, OURS, SLIDING
 from l2m_gtsam.studies.table1.study import TABLE1
 from l2m_gtsam.studies.table1.summary import (
     BETTER,

@@ -23,13 +23,12 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts_around
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import FoundStart, Uncertainty
 from l2m_gtsam.studies.json_arrays import JsonBools, JsonFloats
-from l2m_gtsam.studies.methods import levenberg_marquardt, published
+from l2m_gtsam.studies.methods import as_published, levenberg_marquardt, one_key_from
 from l2m_gtsam.studies.site import Site, SiteDrive, SiteOptions, random_drive
 from l2m_gtsam.studies.statistics import Share
 
@@ -190,7 +189,10 @@ def cells_of(options: BasinOptions, site: Site, distortion: int) -> DistortionCe
     t_true = drive.sensor.t_lidar_mag
     t_start = np.concatenate([random_starts(options, t_true, distortion, ring) for ring in rings])
     found = search(site, drive, t_start, options.search)
-    t_one_key = one_key(site, drive, found.t, options.solve)
+    # From the same place the solve ends in the same.
+    distinct, which = np.unique(found.t, axis=0, return_inverse=True)
+    ends = one_key_from(drive.readings, site.field_map, distinct, options.solve)
+    t_one_key = ends[which.ravel(), :3]
     cells = []
     for index, ring in enumerate(rings):
         rows = slice(index * options.starts, (index + 1) * options.starts)
@@ -204,7 +206,9 @@ def cells_of(options: BasinOptions, site: Site, distortion: int) -> DistortionCe
             margin=found.margin[rows],
             ambiguous=found.ambiguous[rows],
             t_one_key=t_one_key[rows],
-            t_published=as_published(site, drive, few),
+            t_published=np.array(
+                [as_published(drive.readings, site.field_map, t)[:3] for t in few]
+            ),
             t_lm=plain_lm(site, drive, few, options),
         )
         cells.append(cell)
@@ -233,28 +237,6 @@ def search(site: Site, drive: SiteDrive, t_start: FloatArray, options: StartOpti
         np.where(np.isfinite(margin), margin, np.nan),
         np.array([start is not None and start.ambiguous(options.clear) for start in found]),
     )
-
-
-def one_key(
-    site: Site, drive: SiteDrive, t_found: FloatArray, options: OneKeyOptions
-) -> FloatArray:
-    """Return where the one-key solve ends from each start that was found, shape (N, 3).
-
-    Each by itself, as for a vehicle with one sensor; from the same place it ends in the same.
-    """
-    distinct, which = np.unique(t_found, axis=0, return_inverse=True)
-    ends = np.full_like(distinct, np.nan)
-    for row in np.flatnonzero(np.isfinite(distinct).all(axis=1)):
-        solution = solve_one_key(drive.readings, site.field_map, distinct[row][None], options)
-        if solution.solved:
-            ends[row] = solution.estimate.t[0]
-    return ends[which.ravel()]
-
-
-def as_published(site: Site, drive: SiteDrive, t_start: FloatArray) -> FloatArray:
-    """Return where the paper's algorithm ends from each start, NaN off the map, shape (N, 3)."""
-    ends = [published(drive.readings, site.field_map, t) for t in t_start]
-    return np.array([np.full(3, np.nan) if end is None else end.t[0] for end in ends])
 
 
 def plain_lm(

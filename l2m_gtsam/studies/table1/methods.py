@@ -8,13 +8,12 @@ import numpy as np
 from scipy.linalg import polar
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts_around
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
 from l2m_gtsam.studies.magyc_peer import ChipDrive, magyc_peer, magyc_python
-from l2m_gtsam.studies.methods import published, two_step
+from l2m_gtsam.studies.methods import as_published, one_key_from, two_step
 from l2m_gtsam.studies.naive_peer import NaiveMap, NaiveOptions, naive_peer
 
 OURS, NAIVE, MAGYC = "one-key", "naive peer", "magyc"
@@ -51,12 +50,6 @@ def in_two_steps(method: Method) -> Solver:
         return two_step(readings, field_map, t_start, inner).vector(0)
 
     return solve
-
-
-def as_published(readings: Readings, field_map: QueryableMap, t_start: FloatArray) -> FloatArray:
-    """Return where the paper's algorithm ends; NaN if it leaves the map."""
-    end = published(readings, field_map, t_start)
-    return np.full(15, np.nan) if end is None else end.vector(0)
 
 
 OTHERS: dict[str, Solver] = {
@@ -119,11 +112,7 @@ def one_key(
     t_found = np.array([none if each is None else each.t_lidar_mag for each in found])
     searched = (process_time() - begin) / len(t_start)
     places, which = np.unique(t_found, axis=0, return_inverse=True)
-    vector = np.full((len(places), 15), np.nan)
-    begin, somewhere = process_time(), np.flatnonzero(np.isfinite(places).all(axis=1))
-    for row in somewhere:
-        solution = solve_one_key(readings, field_map, places[row][None], options)
-        if solution.solved:
-            vector[row] = solution.estimate.vector(0)
-    solved = (process_time() - begin) / max(len(somewhere), 1)
-    return MethodResult(vector[which.ravel()], len(somewhere), searched + solved)
+    begin, solves = process_time(), int(np.isfinite(places).all(axis=1).sum())
+    vector = one_key_from(readings, field_map, places, options)
+    solved = (process_time() - begin) / max(solves, 1)
+    return MethodResult(vector[which.ravel()], solves, searched + solved)
