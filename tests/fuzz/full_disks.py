@@ -3,31 +3,28 @@
 ``python -m tests.fuzz.full_disks --disks 20 --demo DEMO --out FOLDER``, as whoever may mount.
 """
 
-import argparse
 import os
 import shutil
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 
-from tests.fuzz.corpus import make_demo
 from tests.fuzz.trials import (
-    BAD,
     NEW,
     OLD,
     Command,
     Prepared,
-    commands,
+    asked_for,
     hidden,
     next_run,
     prepared,
     start,
     state,
     table,
+    told,
 )
 
 PAGE = 4096  # that a small file takes
@@ -114,21 +111,8 @@ def fill_all(
 
 def main() -> None:
     """Fill as the command line asks."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--disks", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", action="append", help="name of a command")
-    parser.add_argument("--demo", type=Path, required=True, help="folder of `l2m demo`")
-    parser.add_argument("--out", type=Path, required=True)
-    asked = parser.parse_args()
-    make_demo(asked.demo.resolve())
-    shutil.rmtree(asked.out, ignore_errors=True)
-    asked.out.mkdir(parents=True)
-    chosen = commands(asked.out.resolve(), asked.demo.resolve())
-    wanted = [each for each in chosen if not asked.only or each.name in asked.only]
-    found = fill_all(wanted, asked.disks, asked.out.resolve(), asked.seed)
-    print(table(found))
-    sys.exit(int(any(left in BAD for _, left in found)))
+    chosen, asked = asked_for("disks", 20, __doc__)
+    told(fill_all(chosen, asked.times, asked.out, asked.seed))
 
 
 if __name__ == "__main__":

@@ -4,18 +4,15 @@
 seed, and prints a table.
 """
 
-import argparse
 import os
 import shutil
 import signal
-import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from random import Random
 from time import monotonic, sleep
 
-from tests.fuzz.corpus import make_demo
 from tests.fuzz.trials import (
     BAD,
     MOST_S,
@@ -23,13 +20,14 @@ from tests.fuzz.trials import (
     OLD,
     Command,
     Prepared,
-    commands,
+    asked_for,
     hidden,
     next_run,
     prepared,
     start,
     state,
     table,
+    told,
 )
 
 LOOK_AGAIN_S = 0.0005
@@ -88,21 +86,8 @@ def kill_all(
 
 def main() -> None:
     """Kill as the command line asks."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", action="append", help="name of a command")
-    parser.add_argument("--demo", type=Path, required=True, help="folder of `l2m demo`")
-    parser.add_argument("--out", type=Path, required=True)
-    asked = parser.parse_args()
-    make_demo(asked.demo.resolve())
-    shutil.rmtree(asked.out, ignore_errors=True)
-    asked.out.mkdir(parents=True)
-    chosen = commands(asked.out.resolve(), asked.demo.resolve())
-    wanted = [each for each in chosen if not asked.only or each.name in asked.only]
-    found = kill_all(wanted, asked.kills, asked.out.resolve(), asked.seed)
-    print(table(found))
-    sys.exit(int(any(left in BAD for _, left in found)))
+    chosen, asked = asked_for("kills", 200, __doc__)
+    told(kill_all(chosen, asked.times, asked.out, asked.seed))
 
 
 if __name__ == "__main__":

@@ -1,19 +1,23 @@
 """Commands that are broken off, and what is then in their folder: as before, or as after."""
 
+import argparse
 import hashlib
 import json
 import os
 import re
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
+from typing import NoReturn
 
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.storage.result_set import SET_FILE, check_set
 from tests.drives.fleets import CONFIG, make_place, vehicle
+from tests.fuzz.corpus import make_demo
 from tests.fuzz.runner import GOOD, start_command
 from tests.support.command_line import l2m
 from tests.worlds.study_sites import TINY_BASIN
@@ -270,3 +274,25 @@ def table(found: Counter[tuple[str, str]]) -> str:
         ]
         rows.append([command, *map(str, (sum(counts), *counts))])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
+
+
+def asked_for(what: str, usual: int, about: str) -> tuple[list[Command], argparse.Namespace]:
+    """Return the commands that a command line names, and the rest of what it says."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument(f"--{what}", type=int, default=usual, dest="times")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", action="append", help="name of a command")
+    parser.add_argument("--demo", type=Path, required=True, help="folder of `l2m demo`")
+    parser.add_argument("--out", type=lambda text: Path(text).resolve(), required=True)
+    asked = parser.parse_args()
+    make_demo(asked.demo.resolve())
+    shutil.rmtree(asked.out, ignore_errors=True)
+    asked.out.mkdir(parents=True)
+    chosen = commands(asked.out, asked.demo.resolve())
+    return [each for each in chosen if not asked.only or each.name in asked.only], asked
+
+
+def told(found: Counter[tuple[str, str]]) -> NoReturn:
+    """Print what was found, and end; with exit code 1 if any of it is bad."""
+    print(table(found))
+    sys.exit(int(any(left in BAD for _, left in found)))
