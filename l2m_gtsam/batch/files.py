@@ -14,7 +14,7 @@ from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap, Remembering, refuse_other_frame
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.options import Options, first_fault
-from l2m_gtsam.progress import Count, Progress, counter
+from l2m_gtsam.progress import Count, Progress, counter, reported
 from l2m_gtsam.records.map_diary import UNDATED, MapDrive
 from l2m_gtsam.records.provenance import MapOrigin, NamedSource
 from l2m_gtsam.records.verdict import Level
@@ -183,13 +183,11 @@ class SavedMap:
         """
         for drive in drives:
             self.check_frame(drive)
-        progress("loading the map", 0.0)
-        try:
-            field_map = with_tiles(map_from_state(self.state), self.path)
-        except MapError as error:
-            raise MapError(f"{self.path}: {error}") from error
-        progress("loading the map", 1.0)
-        return field_map
+        with reported("loading the map", progress):
+            try:
+                return with_tiles(map_from_state(self.state), self.path)
+            except MapError as error:
+                raise MapError(f"{self.path}: {error}") from error
 
     def check_frame(self, drive: Recording) -> None:
         """Raise a MapError for a drive that is said to be in another frame."""

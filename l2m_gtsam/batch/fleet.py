@@ -32,7 +32,7 @@ from l2m_gtsam.qa.options import FleetOptions
 from l2m_gtsam.qa.report.fleet_page import fleet_page
 from l2m_gtsam.records.fleet import DriveOutcome, FleetRow
 from l2m_gtsam.records.verdict import Level, worst
-from l2m_gtsam.storage.files import atomic_path, printable, source_file
+from l2m_gtsam.storage.files import printable, source_file, write_text
 from l2m_gtsam.storage.fleet_table import write_csv, write_parquet
 from l2m_gtsam.storage.parts import only_one
 from l2m_gtsam.storage.record_files import read_outcome
@@ -214,8 +214,7 @@ def _publish(out: Path, rows: Sequence[FleetRow], options: FleetOptions, fleet: 
     with published(out, PAGE_FILE, CSV_FILE, PARQUET_FILE) as stage:
         write_csv(stage / CSV_FILE, marked)
         notes = write_parquet(stage / PARQUET_FILE, marked)
-        with atomic_path(stage / PAGE_FILE) as temporary:
-            temporary.write_text(fleet_page(marked, options), encoding="utf-8", errors="replace")
+        write_text(stage / PAGE_FILE, fleet_page(marked, options))
     return replace(fleet, rows=marked, notes=notes)
 
 

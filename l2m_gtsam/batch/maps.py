@@ -15,7 +15,7 @@ from l2m_gtsam.mapping.map_building import compare_recordings, map_recordings, u
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary, Remembering
-from l2m_gtsam.progress import Progress
+from l2m_gtsam.progress import Progress, reported
 from l2m_gtsam.records.map_diary import MapDiary
 from l2m_gtsam.records.provenance import MapOrigin
 from l2m_gtsam.storage.map_file import save_map
@@ -87,9 +87,8 @@ def build_map_file(
         refuse_structure(config.mapping.model.kind)
     survey = read_survey(bags, config, suite, structure, progress)
     scanned = scanned_place(bags, survey.recordings, config, progress) if lidar else None
-    progress("building the map", 0.0)
-    field_map = map_recordings(survey.recordings, survey.suite, config.mapping, survey.cloud)
-    progress("building the map", 1.0)
+    with reported("building the map", progress):
+        field_map = map_recordings(survey.recordings, survey.suite, config.mapping, survey.cloud)
     provenance = {
         "bags": [vars(recording.source) for recording in survey.recordings],
         "suite": None if suite is None else used_file(suite, survey.suite_level),
@@ -135,9 +134,10 @@ def update_map_file(
     """
     check_outputs(out, suffix=".npz")
     drives = _added(map_path, bags, config, suite, progress)
-    progress("updating the map", 0.0)
-    updated = update_map(drives.field_map, drives.recordings, drives.survey.suite, config.mapping)
-    progress("updating the map", 1.0)
+    with reported("updating the map", progress):
+        updated = update_map(
+            drives.field_map, drives.recordings, drives.survey.suite, config.mapping
+        )
     return drives.write(out, updated, config)
 
 
@@ -179,16 +179,15 @@ def keep_map_file_up(
             "confused; give its calibration with --suite"
         )
     drives = _added(map_path, bags, config, suite, progress)
-    progress("looking for what changed", 0.0)
-    kept = kept_up(
-        drives.field_map,
-        drives.recordings,
-        drives.survey.suite or {},
-        config.mapping,
-        config.calibration.changes,
-        drives.saved.surveyed,
-    )
-    progress("looking for what changed", 1.0)
+    with reported("looking for what changed", progress):
+        kept = kept_up(
+            drives.field_map,
+            drives.recordings,
+            drives.survey.suite or {},
+            config.mapping,
+            config.calibration.changes,
+            drives.saved.surveyed,
+        )
     return drives.write(out, kept, config)
 
 

@@ -26,7 +26,7 @@ from l2m_gtsam.geometry import compose
 from l2m_gtsam.lidar.surface import Surface, library
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.progress import Progress, silent
+from l2m_gtsam.progress import Progress, reported, silent
 from l2m_gtsam.qa.metrics.trajectory import ComparedTrajectories, check_truth, truth_record
 from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.calibration import CalibrationResult
@@ -295,9 +295,8 @@ def _write_map_so_far(
     points, field = slam.estimator.field_along_path()
     if len(points) < LEAST_POINTS:
         return
-    progress("building the map", 0.0)
-    field_map = build_map(points, field, config.mapping.model)
-    progress("building the map", 1.0)
+    with reported("building the map", progress):
+        field_map = build_map(points, field, config.mapping.model)
     provenance = {
         "bags": [vars(recording.source)],
         "frame": "map",

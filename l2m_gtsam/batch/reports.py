@@ -33,7 +33,7 @@ from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.verdict import Judgement, Level, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
-from l2m_gtsam.storage.files import atomic_path, source_file
+from l2m_gtsam.storage.files import atomic_path, source_file, write_text
 from l2m_gtsam.storage.record_files import read_metrics, read_slam, record_id, write_slam
 from l2m_gtsam.storage.report_id import SHOWN
 from l2m_gtsam.storage.result_set import published
@@ -101,12 +101,7 @@ def write_slam_report(
 
     text = localisation_page(record, options, identity)
     with published(page.parent, page.name, adds=True) as stage:
-        _write_page(stage / page.name, text)
-
-
-def _write_page(path: Path, page: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8", errors="replace")
+        write_text(stage / page.name, text)
 
 
 BROWSERS = (
@@ -326,7 +321,7 @@ def write_report(
     check_names([each.sensor for each in result.sensors], options)
     page = calibration_page(result, metrics, options, progress, identity)
     with published(folder, REPORT_FILE, adds=True) as stage:
-        _write_page(stage / REPORT_FILE, page)
+        write_text(stage / REPORT_FILE, page)
     return judge(result, metrics, options)
 
 

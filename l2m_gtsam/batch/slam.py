@@ -21,7 +21,7 @@ from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, localise_
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.progress import Progress
+from l2m_gtsam.progress import Progress, reported
 from l2m_gtsam.qa.metrics.trajectory import check_truth
 from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.qa.verdict.localisation import judgement_of_localisation
@@ -292,9 +292,8 @@ def _explored(
     progress: Progress,
 ) -> _Found:
     found = explore(recording, calibration, config.slam, progress, evidence)
-    progress("building the map", 0.0)
-    field_map = build_map(found.points, found.field, config.mapping.model)
-    progress("building the map", 1.0)
+    with reported("building the map", progress):
+        field_map = build_map(found.points, found.field, config.mapping.model)
     return _Found(recording, found.result, found.solution, field_map)
 
 

@@ -26,7 +26,7 @@ from l2m_gtsam.records.validation import (
     Validation,
 )
 from l2m_gtsam.storage.bag_options import BagOptions, PoseFileOptions
-from l2m_gtsam.storage.files import atomic_path, source_file
+from l2m_gtsam.storage.files import source_file, write_text
 from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.record_files import write_validation
 from l2m_gtsam.storage.result_set import published
@@ -212,5 +212,4 @@ def _write(folder: Path, found: Validation) -> None:
     with published(folder, VALIDATION_FILE, PAGE_FILE) as stage:
         written = write_validation(stage / VALIDATION_FILE, found)
         page = validation_page(found, Identity(written, source_file(stage / VALIDATION_FILE)))
-        with atomic_path(stage / PAGE_FILE) as temporary:
-            temporary.write_text(page, encoding="utf-8", errors="replace")
+        write_text(stage / PAGE_FILE, page)

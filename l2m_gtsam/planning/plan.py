@@ -35,7 +35,7 @@ from l2m_gtsam.planning.motion import (
     places_around,
     strongest,
 )
-from l2m_gtsam.progress import Progress, silent
+from l2m_gtsam.progress import Progress, reported, silent
 from l2m_gtsam.records.plan import DrivePlan, MotionPlan, SensorPlan, Worst
 from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
@@ -126,9 +126,8 @@ def plan(
     noise = _noise(field_map, options, planning)
     priors = priors_of(options.priors, readings.sensors)
     task = Task(solver_map, _places(readings.sensors, options, priors), noise, options, priors)
-    progress("what the drive determines", 0.0)
-    found = task.forecast(readings)
-    progress("what the drive determines", 1.0)
+    with reported("what the drive determines", progress):
+        found = task.forecast(readings)
     if not found.view.inside.any():
         raise CalibrationError(f"the map does not cover the drive {recording.source.path}")
     sensors = _sensor_plans(synchronised, recording.trajectory, found, task)

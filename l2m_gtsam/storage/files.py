@@ -63,7 +63,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """
     with renamed_path(path) as temporary:
         yield temporary
-        _flush(temporary)
+        flush(temporary)
 
 
 @contextmanager
@@ -103,10 +103,19 @@ def unwritten(path: Path, error: OSError, what: str = "cannot be written") -> Ou
     return OutputError(line)
 
 
-def _flush(path: Path) -> None:
-    """Have the content on the disk before the name points to it."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
+def flush(path: Path) -> None:
+    """Have what a file or a folder holds on the disk, before a name points to it."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text, whole or not at all; what no file can hold of it is replaced."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="replace")
 
 
 CHUNK_BYTES = 1 << 20

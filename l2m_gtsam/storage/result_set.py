@@ -7,7 +7,6 @@ only has to move. ``results.json`` lists the files with their digests. What iden
 the report id in it, see ``report_id``.
 """
 
-import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from l2m_gtsam.errors import L2MError, OutputError
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.storage.bounded import read_content
-from l2m_gtsam.storage.files import source_file, unwritten
+from l2m_gtsam.storage.files import flush, source_file, unwritten
 from l2m_gtsam.storage.parts import only_one, part_folder
 
 SET_FILE = "results.json"
@@ -163,24 +162,24 @@ def _list(stage: Path, files: Mapping[str, str], gone: Collection[str]) -> None:
     """Write the list of a set, with the digests of all that is in it, and what it replaces."""
     if not files:
         _write_flushed(stage / GONE, "\n".join(sorted({*gone, SET_FILE})))
-        _flush(stage)
+        flush(stage)
         return
     content = _SetFile("l2m-results", 2, dict(sorted(files.items())))
     _write_flushed(stage / SET_FILE, f"{_SET.dump_json(content, indent=1).decode()}\n")
     _write_flushed(stage / GONE, "\n".join(sorted(gone)))
-    _flush(stage)
+    flush(stage)
 
 
 def _write_flushed(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
-    _flush(path)
+    flush(path)
 
 
 def _commit(stage: Path, folder: Path) -> None:
     with only_one(folder, WAIT_S):
         _move_all(folder)  # of one that was killed
         stage.rename(stage.with_suffix(READY))
-        _flush(folder)
+        flush(folder)
         _move_all(folder)
 
 
@@ -204,7 +203,7 @@ def _move(ready: Path, folder: Path) -> None:
         listed.replace(folder / SET_FILE)
     gone.unlink(missing_ok=True)
     ready.rmdir()
-    _flush(folder)
+    flush(folder)
 
 
 @contextmanager
@@ -214,11 +213,3 @@ def _said_of(stage: Path, folder: Path) -> Iterator[None]:
         yield
     except L2MError as error:
         raise type(error)(str(error).replace(str(stage), str(folder))) from error
-
-
-def _flush(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -21,7 +21,7 @@ from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.report.svg import save_figure
 from l2m_gtsam.storage.bounded import read_content
-from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.files import write_text
 from l2m_gtsam.storage.parts import only_one
 from l2m_gtsam.storage.result_set import made, published
 from l2m_gtsam.studies.study import Study
@@ -246,12 +246,6 @@ class CellFolder(Generic[Cell]):
             return self.content.validate_python(read_json(file))
         except ValidationError as error:
             raise ConfigError(f"{file}: not a cell of this study; remove it") from error
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file, whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
