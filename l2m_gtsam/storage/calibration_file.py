@@ -254,8 +254,10 @@ def _as_record(content: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
-def verdict_entry(judgement: Judgement) -> dict[str, Any]:
+def verdict_entry(judgement: Judgement | None) -> dict[str, Any]:
     """Return a judgement as plain values: the verdict, and what it rests on beside it."""
+    if judgement is None:
+        return {"level": NOT_JUDGED}
     plain = _JUDGEMENT.dump_python(judgement)
     earlier = {"earlier": plain["earlier"]} if plain["earlier"] else {}
     return {**plain["verdict"], **earlier, "thresholds": plain["thresholds"]}
@@ -263,8 +265,6 @@ def verdict_entry(judgement: Judgement) -> dict[str, Any]:
 
 def verdict_text(result: CalibrationResult, source: SourceFile) -> str:
     """Return the verdict on a calibration, and which it is, as JSON for other files."""
-    judged = result.judgement
-    verdict = {"level": NOT_JUDGED} if judged is None else verdict_entry(judged)
     content = {
         "format": "l2m-verdict",
         "version": 1,
@@ -273,7 +273,7 @@ def verdict_text(result: CalibrationResult, source: SourceFile) -> str:
             "sha256": source.sha256,
             **({"report_id": result.report_id} if result.report_id else {}),
         },
-        "verdict": verdict,
+        "verdict": verdict_entry(result.judgement),
     }
     return json.dumps(content, ensure_ascii=False)
 

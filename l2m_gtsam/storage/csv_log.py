@@ -97,7 +97,7 @@ def read_csv_log(path: Path, options: ColumnOptions) -> TableLog:
         warnings.warn(f"{path}: left out: columns {shown(each)}", Notice, stacklevel=2)
     channels = [_readings(table, name) for name in table.roles.fields]
     if table.roles.position is not None and table.roles.orientation is not None:
-        channels.append(TableTopic(POSE_TOPIC, CSV_POSE_TYPE, *_poses(table)))
+        channels.append(_poses(table))
     if not channels:
         raise BagError(
             f"{path}: no columns of a magnetometer (as mag_x, mag_y, mag_z) or of poses (x, y, z, "
@@ -271,19 +271,13 @@ def _readings(table: NamedColumns, name: str) -> TableTopic:
     return TableTopic(f"/{name}", CSV_FIELD_TYPE, table.stamp_ns[kept], contents, columns.unit)
 
 
-def _poses(table: NamedColumns) -> tuple[IntArray, "PoseMaker"]:
-    """Return times and poses of the rows that have one."""
+def _poses(table: NamedColumns) -> TableTopic:
+    """Return the poses of the rows that have one."""
     values = table.rows([*(table.roles.position or ()), *(table.roles.orientation or ())])
     kept = ~np.isnan(values).any(axis=1)
-    return table.stamp_ns[kept], PoseMaker(values[kept])
+    rows = values[kept]
 
+    def contents() -> Iterator[CsvPose]:
+        return (CsvPose(Position(*row[:3]), Orientation(*row[3:])) for row in rows.tolist())
 
-@dataclass(frozen=True)
-class PoseMaker:
-    """Makes poses of rows x, y, z, qx, qy, qz, qw, shape (N, 7)."""
-
-    rows: FloatArray
-
-    def __call__(self) -> Iterator[CsvPose]:
-        """Yield the poses."""
-        return (CsvPose(Position(*r[:3]), Orientation(*r[3:])) for r in self.rows.tolist())
+    return TableTopic(POSE_TOPIC, CSV_POSE_TYPE, table.stamp_ns[kept], contents)

@@ -9,7 +9,6 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.geometry import as_matrix
-from l2m_gtsam.records.verdict import NOT_JUDGED
 from l2m_gtsam.storage.calibration_file import (
     MODEL,
     UNCERTAINTY,
@@ -38,14 +37,12 @@ def json_text(export: Export) -> str:
     Numbers that are not finite, which JSON does not have, are null.
     """
     result = export.result
-    judged = result.judgement
-    verdict = {"level": NOT_JUDGED} if judged is None else verdict_entry(judged)
     content = {
         "format": "l2m-export",
         "version": 1,
         **({"report_id": result.report_id} if result.report_id else {}),
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL, "infinite": UNKNOWN},
-        "verdict": verdict,
+        "verdict": verdict_entry(result.judgement),
         "lidar_frame": export.lidar_frame,
         **source_entries(result),
         "versions": result.versions,
