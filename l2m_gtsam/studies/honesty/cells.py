@@ -9,7 +9,7 @@ import numpy as np
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.one_key import solve_one_key
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray, chosen_rows
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.honesty.drives import (
@@ -84,7 +84,7 @@ class Outcomes:
         return len(np.unique(self.survey)) > 1
 
     def __getitem__(self, rows: IntArray) -> "Outcomes":
-        return Outcomes(self.error[rows], self.covariance[rows], self.survey[rows])
+        return chosen_rows(self, rows)
 
 
 @dataclass(frozen=True)
