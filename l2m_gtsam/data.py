@@ -48,19 +48,21 @@ class InFile:
 Table = TypeVar("Table")
 
 
-def joined(parts: Sequence[Table]) -> Table:
+def joined_rows(parts: Sequence[Table]) -> Table:
     """Return tables of arrays as one, the rows of each after those of the one before.
 
     Parameters
     ----------
     parts
         At least one, all of one dataclass. Its fields are arrays with a value for each row, such
-        tables themselves, or the same in all parts.
+        tables themselves, or the same in all parts. What one part lacks, all lack.
     """
 
     def column(values: Sequence[Any]) -> Any:
+        if any(each is None for each in values):
+            return None
         if is_dataclass(values[0]):
-            return joined(values)
+            return joined_rows(values)
         return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
 
     first: Any = parts[0]
@@ -70,7 +72,7 @@ def joined(parts: Sequence[Table]) -> Table:
 
 
 def chosen_rows(table: Table, rows: IntArray | BoolArray) -> Table:
-    """Return chosen rows of a table of arrays as in ``joined``."""
+    """Return chosen rows of a table of arrays as in ``joined_rows``."""
 
     def chosen(values: Any) -> Any:
         if is_dataclass(values):
@@ -275,12 +277,7 @@ class LidarMotion:
         """Return motion at constant velocities, shape (N, 6), with poses at the stamps."""
         return cls(twist_lidar, np.zeros_like(twist_lidar), np.zeros(len(twist_lidar)))
 
-    @classmethod
-    def joined(cls, parts: Sequence["LidarMotion"]) -> "LidarMotion":
-        """Return the motion at all readings of some parts."""
-        return joined(parts)
-
-    def __getitem__(self, rows: IntArray) -> "LidarMotion":
+    def __getitem__(self, rows: IntArray | BoolArray) -> "LidarMotion":
         return chosen_rows(self, rows)
 
 

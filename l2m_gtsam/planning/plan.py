@@ -22,6 +22,7 @@ from l2m_gtsam.data import (
     SyncCounts,
     Synchronised,
     Trajectory,
+    joined_rows,
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.geometry import polar_rotation
@@ -178,23 +179,20 @@ def only(readings: Readings, sensor: int) -> Readings:
 
 def with_motion(readings: Readings, motion: ExtraMotion) -> Readings:
     """Return the readings of a drive to which a motion is added: one per sensor and pose."""
-    S, K, moving, roots = len(readings.sensors), len(motion.p), None, readings.pose_root
+    S, K, roots = len(readings.sensors), len(motion.p), readings.pose_root
     later = BREAK_NS + np.round(NANOSECONDS * motion.seconds).astype(np.int64)
-    if readings.motion is not None:
-        added = LidarMotion.steady(np.tile(motion.twist, (S, 1)))
-        moving = LidarMotion.joined([readings.motion, added])
-    sensor = np.concatenate([readings.sensor, np.repeat(np.arange(S), K)])
-    joined = Readings(
+    added = Readings(
         readings.sensors,
-        sensor,
-        np.concatenate([readings.stamp_ns, np.tile(readings.stamp_ns.max() + later, S)]),
-        np.concatenate([readings.R_map_lidar, np.tile(motion.R, (S, 1, 1))]),
-        np.concatenate([readings.p_map_lidar, np.tile(motion.p, (S, 1))]),
-        np.concatenate([readings.field, np.zeros((S * K, 3))]),
-        moving,
-        None if roots is None else np.concatenate([roots, np.tile(roots[:1], (S * K, 1, 1))]),
+        np.repeat(np.arange(S), K),
+        np.tile(readings.stamp_ns.max() + later, S),
+        np.tile(motion.R, (S, 1, 1)),
+        np.tile(motion.p, (S, 1)),
+        np.zeros((S * K, 3)),
+        LidarMotion.steady(np.tile(motion.twist, (S, 1))),
+        None if roots is None else np.tile(roots[:1], (S * K, 1, 1)),
     )
-    return joined[np.argsort(sensor, kind="stable")]
+    both = joined_rows([readings, added])
+    return both[np.argsort(both.sensor, kind="stable")]
 
 
 def worst(sensor: str, covariance: FloatArray, rank: RankOptions) -> Worst:

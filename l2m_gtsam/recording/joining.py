@@ -15,7 +15,6 @@ import numpy as np
 from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,
-    IntArray,
     LidarMotion,
     Readings,
     Recording,
@@ -24,6 +23,7 @@ from l2m_gtsam.data import (
     SyncCounts,
     Synchronised,
     Trajectory,
+    joined_rows,
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.recording.saturation import limits_together
@@ -85,25 +85,24 @@ def joined_readings(parts: Sequence[Synchronised], recording: Recording) -> Sync
         return parts[0]
     names = tuple(each.sensor for each in recording.series)
     readings = [each.readings for each in parts]
-    sensor = np.concatenate(
-        [np.array([names.index(n) for n in r.sensors], dtype=np.int64)[r.sensor] for r in readings]
-    )
-    drive = np.repeat(np.arange(len(readings)), [len(each) for each in readings])
-    stamps = [r.stamp_ns + by for r, by in zip(readings, recording.moved_ns, strict=True)]
-    whole = Readings(
-        sensors=names,
-        sensor=sensor,
-        stamp_ns=np.concatenate(stamps),
-        R_map_lidar=np.concatenate([each.R_map_lidar for each in readings]),
-        p_map_lidar=np.concatenate([each.p_map_lidar for each in readings]),
-        field=np.concatenate([each.field for each in readings]),
-        motion=_motion(readings),
-        pose_root=_pose_root(readings),
-        regressors=_regressors(readings),
-        drive=drive,
+    moving = any(each.motion is not None for each in readings)
+    uncertain = any(each.pose_root is not None for each in readings)
+    whole = joined_rows(
+        [
+            replace(
+                each,
+                sensors=names,
+                sensor=np.array([names.index(name) for name in each.sensors])[each.sensor],
+                stamp_ns=each.stamp_ns + by,
+                motion=_motion(each) if moving else None,
+                pose_root=_pose_root(each) if uncertain else None,
+                drive=np.full(len(each), number),
+            )
+            for number, (each, by) in enumerate(zip(readings, recording.moved_ns, strict=True))
+        ]
     )
     counts = tuple(_counts(name, parts) for name in names)
-    return Synchronised(whole[np.argsort(sensor, kind="stable")], counts)
+    return Synchronised(whole[np.argsort(whole.sensor, kind="stable")], counts)
 
 
 def drive_at(recording: Recording, stamp_ns: int) -> int:
@@ -190,28 +189,16 @@ def _trajectory(drives: Sequence[Recording], moved: Sequence[int]) -> Trajectory
 
     So a pose beyond a drive's end is that of its end, as it is for a single drive.
     """
-    stamps: list[IntArray] = []
-    rows: list[tuple[int, IntArray]] = []
+    parts = []
     for k, (drive, by) in enumerate(zip(drives, moved, strict=True)):
         own = drive.trajectory.stamp_ns + by
         before = [own[0] - PAUSE_NS // 2 + JUMP_NS] if k > 0 else []
         after = [own[-1] + PAUSE_NS // 2] if k + 1 < len(drives) else []
-        stamps.append(np.concatenate([before, own, after]).astype(np.int64))
+        stamps = np.concatenate([before, own, after]).astype(np.int64)
         first, last = [0] * len(before), [len(own) - 1] * len(after)
-        rows.append((k, np.concatenate([first, np.arange(len(own)), last]).astype(np.int64)))
-    poses = [drive.trajectory for drive in drives]
-    covariances = [each.covariance for each in poses]
-    known = [each for each in covariances if each is not None]
-    return Trajectory(
-        stamp_ns=np.concatenate(stamps),
-        R=np.concatenate([poses[k].R[at] for k, at in rows]),
-        p=np.concatenate([poses[k].p[at] for k, at in rows]),
-        frame=poses[0].frame,
-        child_frame=poses[0].child_frame,
-        covariance=np.concatenate([known[k][at] for k, at in rows])
-        if len(known) == len(poses)
-        else None,
-    )
+        rows = np.concatenate([first, np.arange(len(own)), last]).astype(np.int64)
+        parts.append(replace(drive.trajectory[rows], stamp_ns=stamps))
+    return joined_rows(parts)
 
 
 def _sensors(drives: Sequence[Recording]) -> list[str]:
@@ -248,30 +235,14 @@ def _source(drives: Sequence[Recording]) -> SourceFile:
     return SourceFile(paths, hashlib.sha256(digests.encode()).hexdigest())
 
 
-def _motion(readings: Sequence[Readings]) -> LidarMotion | None:
-    if all(each.motion is None for each in readings):
-        return None
-    at_rest = (LidarMotion.steady(np.zeros((len(each), 6))) for each in readings)
-    known = (each.motion for each in readings)
-    return LidarMotion.joined(
-        [rest if moving is None else moving for moving, rest in zip(known, at_rest, strict=True)]
-    )
+def _motion(readings: Readings) -> LidarMotion:
+    at_rest = LidarMotion.steady(np.zeros((len(readings), 6)))
+    return at_rest if readings.motion is None else readings.motion
 
 
-def _pose_root(readings: Sequence[Readings]) -> FloatArray | None:
-    if all(each.pose_root is None for each in readings):
-        return None
-    return np.concatenate(
-        [
-            np.zeros((len(each), 6, 6)) if each.pose_root is None else each.pose_root
-            for each in readings
-        ]
-    )
-
-
-def _regressors(readings: Sequence[Readings]) -> FloatArray | None:
-    found = [each.regressors for each in readings if each.regressors is not None]
-    return np.concatenate(found) if found else None
+def _pose_root(readings: Readings) -> FloatArray:
+    exact = np.zeros((len(readings), 6, 6))
+    return exact if readings.pose_root is None else readings.pose_root
 
 
 def _counts(name: str, parts: Sequence[Synchronised]) -> SyncCounts:

@@ -17,6 +17,7 @@ from l2m_gtsam.data import (
     SyncCounts,
     Synchronised,
     Trajectory,
+    joined_rows,
 )
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.geometry import interpolated_rotations
@@ -78,7 +79,8 @@ def synchronise(
         counts.append(count)
     if not any(count.kept or count.saturated for count in counts):
         raise SyncError(_nothing_left(recording, options, largest_offset_s))
-    return Synchronised(_concatenate(recording, parts), tuple(counts))
+    names = tuple(series.sensor for series in recording.series)
+    return Synchronised(replace(joined_rows(parts), sensors=names), tuple(counts))
 
 
 def _synchronise_one(
@@ -276,19 +278,6 @@ def _first_in_cell(readings: Readings, options: SyncOptions) -> BoolArray:
     keep = np.zeros(len(readings), dtype=np.bool_)
     keep[first] = True
     return keep
-
-
-def _concatenate(recording: Recording, parts: list[Readings]) -> Readings:
-    motions = [part.motion for part in parts if part.motion is not None]
-    return Readings(
-        sensors=tuple(series.sensor for series in recording.series),
-        sensor=np.concatenate([part.sensor for part in parts]),
-        stamp_ns=np.concatenate([part.stamp_ns for part in parts]),
-        R_map_lidar=np.concatenate([part.R_map_lidar for part in parts]),
-        p_map_lidar=np.concatenate([part.p_map_lidar for part in parts]),
-        field=np.concatenate([part.field for part in parts]),
-        motion=LidarMotion.joined(motions),
-    )
 
 
 def _nothing_left(recording: Recording, options: SyncOptions, largest_offset_s: float) -> str:

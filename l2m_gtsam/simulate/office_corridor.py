@@ -8,11 +8,10 @@ z = 0 is the floor, the corridor runs along x and is centred on the origin.
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Self
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.data import BoolArray, FloatArray, joined_rows
 
 MICROTESLA = 0.1  # of a pole of 1 A m at a metre: mu0 / 4 pi
 EARTH = np.array([17.0, -9.0, -44.0])  # uT
@@ -30,13 +29,6 @@ class Rods:
     first: FloatArray
     last: FloatArray
     pole: FloatArray
-
-    @classmethod
-    def joined(cls, parts: "list[Rods]") -> Self:
-        """Return the rods of all parts."""
-        first = np.concatenate([np.zeros((0, 3)), *(each.first for each in parts)])
-        last = np.concatenate([np.zeros((0, 3)), *(each.last for each in parts)])
-        return cls(first, last, np.concatenate([np.zeros(0), *(each.pole for each in parts)]))
 
     def field(self, points: FloatArray) -> FloatArray:
         """Return their field at points (P, 3) in uT, shape (P, 3)."""
@@ -63,16 +55,6 @@ class Sheets:
     side: FloatArray
     other: FloatArray
     current: FloatArray
-
-    @classmethod
-    def joined(cls, parts: "list[Sheets]") -> Self:
-        """Return the sheets of all parts."""
-        corner, side, other = (
-            np.concatenate([np.zeros((0, 3)), *(getattr(each, name) for each in parts)])
-            for name in ("corner", "side", "other")
-        )
-        current = np.concatenate([np.zeros(0), *(each.current for each in parts)])
-        return cls(corner, side, other, current)
 
     def field(self, points: FloatArray) -> FloatArray:
         """Return their field at points (P, 3) in uT, shape (P, 3)."""
@@ -167,7 +149,7 @@ def office_corridor(seed: int) -> OfficeCorridor:
     angle = rng.uniform(0, np.pi, 3)
     waves = 2 * np.pi / length * np.stack([np.cos(angle), np.sin(angle)])
     swell = np.column_stack([waves.T, rng.uniform(-np.pi, np.pi, 3), np.full(3, 2.5e-3)])
-    return OfficeCorridor(Rods.joined(rods), Sheets.joined(sheets), Rods.joined(hidden), swell)
+    return OfficeCorridor(joined_rows(rods), joined_rows(sheets), joined_rows(hidden), swell)
 
 
 def door_frame(rng: np.random.Generator, x: float, wall: float, pole: float) -> Rods:

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, joined_rows
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.floor_plan import NARROWEST_AISLE, FloorPlan, FloorPlanOptions, plan_floor
 from l2m_gtsam.simulate.route import (
@@ -158,7 +158,7 @@ def hall(
     return SimulatedPlace(
         plan,
         world,
-        room.joined(bodies),
+        joined_rows([room, bodies]),
         bodies,
         mapping_route(routes.mapping, plan),
         calibration_route(routes.calibration, plan),
@@ -178,7 +178,7 @@ def corridor(
     return SimulatedPlace(
         plan,
         world,
-        corridor_room(options).joined(Solids.of(world)),
+        joined_rows([corridor_room(options), Solids.of(world)]),
         corridor_walls(options),
         corridor_survey(options, routes.mapping),
         corridor_route(options, routes.calibration),

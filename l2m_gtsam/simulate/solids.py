@@ -57,14 +57,6 @@ class Solids:
         """Return the bodies of a world as light meets them."""
         return cls(world.dimensions, world.centres, world.R_map_body)
 
-    def joined(self, other: "Solids") -> "Solids":
-        """Return these boxes and others."""
-        return Solids(
-            np.concatenate([self.dimensions, other.dimensions]),
-            np.concatenate([self.centres, other.centres]),
-            np.concatenate([self.R_map_body, other.R_map_body]),
-        )
-
     def vertices(self) -> FloatArray:
         """Return the corners of all boxes in the map in metres, shape (8 N, 3)."""
         own = CORNERS * self.dimensions[:, None]

@@ -5,14 +5,13 @@ its own features. Beside every steel structure stands a timber one of the same s
 both, the field only the first. z = 0 is the floor, the area is centred on the origin.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.data import BoolArray, FloatArray, joined_rows
 from l2m_gtsam.simulate.world import SteelWorld
 
 MILD, STRONG = 1.0, 10.0  # factors on the polarisation of posts and racks
@@ -48,17 +47,6 @@ class Boxes:
     centres: FloatArray
     yaw: FloatArray
     remanence: FloatArray
-
-    @classmethod
-    def joined(cls, parts: "tuple[Boxes, ...]") -> Self:
-        """Return the boxes of all parts."""
-        return cls(
-            sum((part.kinds for part in parts), ()),
-            np.concatenate([np.zeros((0, 3)), *(part.dimensions for part in parts)]),
-            np.concatenate([np.zeros((0, 3)), *(part.centres for part in parts)]),
-            np.concatenate([np.zeros(0), *(part.yaw for part in parts)]),
-            np.concatenate([np.zeros(0), *(part.remanence for part in parts)]),
-        )
 
 
 @dataclass(frozen=True)
@@ -295,10 +283,10 @@ def steel_hall(seed: int, strength: float = MILD, posts: int = 4, racks: int = 1
         for index, place in enumerate(places)
     ]
     steel, timber = tuple(standing[::2]), tuple(standing[1::2])
-    inside = Boxes.joined(tuple(structure.boxes for structure in steel))
-    boxes = Boxes.joined((floor, ceiling, inside))
+    parts = [floor, ceiling, *(structure.boxes for structure in steel)]
+    boxes = replace(joined_rows(parts), kinds=sum((each.kinds for each in parts), ()))
     factor = np.ones(len(boxes.kinds))
-    factor[len(factor) - len(inside.kinds) :] = strength
+    factor[len(floor.kinds) + len(ceiling.kinds) :] = strength
     world = _magnetised(rng, boxes, factor)
     return SteelHall(world, steel, timber, _uneven_floor(rng))
 

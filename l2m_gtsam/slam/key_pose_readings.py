@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from l2m_factors import KeyPoseReadings
-from l2m_gtsam.data import FloatArray, IntArray, Readings, Trajectory, joined
+from l2m_gtsam.data import FloatArray, IntArray, Readings, Trajectory, joined_rows
 from l2m_gtsam.geometry import turn_angle
 
 ARM_M = 1.0  # lever arm that converts a rotation into a distance
@@ -66,7 +66,7 @@ def no_readings() -> KeyPoseReadings:
 
 def joined_readings(parts: Sequence[KeyPoseReadings]) -> KeyPoseReadings:
     """Return readings of some key poses, whose clocks are no variables, as one."""
-    return joined([no_readings(), *parts])
+    return joined_rows([no_readings(), *parts])
 
 
 def _key_poses(readings: Readings, trajectory: Trajectory, rows: IntArray) -> IntArray:

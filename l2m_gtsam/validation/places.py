@@ -18,7 +18,7 @@ from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.drive_sources import drive_sources
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import FloatArray, LidarMotion, Readings
+from l2m_gtsam.data import FloatArray, Readings, joined_rows
 from l2m_gtsam.maps.sources.found_sources import FoundSources, price, refined
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.qa.options import QaOptions
@@ -229,20 +229,5 @@ def spread(C: FloatArray, parts: Parts) -> FloatArray:
 
 def together(parts: Sequence[Readings], names: tuple[str, ...]) -> Readings:
     """Return readings of single sensors as those of all."""
-    counts = [len(each) for each in parts]
-
-    def joined(values: Sequence[FloatArray | None]) -> FloatArray | None:
-        known = [each for each in values if each is not None]
-        return np.concatenate(known) if len(known) == len(parts) else None
-
-    moving = [each.motion for each in parts if each.motion is not None]
-    return Readings(
-        sensors=names,
-        sensor=np.repeat(np.arange(len(parts)), counts),
-        stamp_ns=np.concatenate([each.stamp_ns for each in parts]),
-        R_map_lidar=np.concatenate([each.R_map_lidar for each in parts]),
-        p_map_lidar=np.concatenate([each.p_map_lidar for each in parts]),
-        field=np.concatenate([each.field for each in parts]),
-        motion=LidarMotion.joined(moving) if len(moving) == len(parts) else None,
-        pose_root=joined([each.pose_root for each in parts]),
-    )
+    sensor = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
+    return replace(joined_rows(parts), sensors=names, sensor=sensor, regressors=None, drive=None)

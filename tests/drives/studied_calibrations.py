@@ -8,7 +8,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, joined_rows
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, hall_cloud, steel_hall
 from l2m_gtsam.studies.honesty.cells import Outcomes
@@ -190,7 +190,7 @@ def _outcomes(
             for method, calibrate in case.methods.items():
                 solved = calibrate(drive, field_map, start)
                 parts[method].append(_compared(solved, drive, seed))
-    return {method: Outcomes.joined(part) for method, part in parts.items()}
+    return {method: joined_rows(part) for method, part in parts.items()}
 
 
 def _drives(

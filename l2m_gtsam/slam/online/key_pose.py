@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from l2m_factors import KeyPoseReadings
-from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, joined
+from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, joined_rows
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
 from l2m_gtsam.slam.key_pose_readings import joined_readings, no_readings
 from l2m_gtsam.slam.links import Links
@@ -165,7 +165,7 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
         start=start,
         sensors=sensors,
         reading_ns=np.concatenate([each.reading_ns for each in key_poses]),
-        links=joined([each.links for each in key_poses]),
+        links=joined_rows([each.links for each in key_poses]),
     )
 
 

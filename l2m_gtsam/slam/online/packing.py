@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from l2m_factors import KeyPoseReadings
-from l2m_gtsam.data import FloatArray, RigidTransform, joined
+from l2m_gtsam.data import FloatArray, RigidTransform, joined_rows
 from l2m_gtsam.maps.potential import PotentialHyperparameters
 from l2m_gtsam.slam.drive import as_poses
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose
@@ -62,7 +62,7 @@ def unpacked_poses(arrays: Arrays) -> list[gtsam.Pose3]:
 def packed_key_poses(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
     """Return key poses as arrays."""
     readings = joined_readings([each.readings for each in key_poses])
-    links = joined([Links.none(), *(each.links for each in key_poses)])
+    links = joined_rows([Links.none(), *(each.links for each in key_poses)])
     return {
         "number": np.array([each.number for each in key_poses], dtype=np.int64),
         "stamp_ns": np.array([each.stamp_ns for each in key_poses], dtype=np.int64),

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from l2m_gtsam.data import RigidTransform, joined
+from l2m_gtsam.data import RigidTransform, joined_rows
 from l2m_gtsam.geometry import between, compose, difference, moved
 from l2m_gtsam.lidar.loop_closures import KeyScan, LoopOptions, candidates, closing_loop
 from l2m_gtsam.lidar.odometry import LEAST_POINTS
@@ -90,7 +90,7 @@ class ScanMatcher:
                 continue
             found.append(self._link(by_scan(seen, guess, registration), each, number))
             self._path_m = 0.0
-        return ScanLinks(joined(found), tuple(refused))
+        return ScanLinks(joined_rows(found), tuple(refused))
 
     def _link(self, fix: PoseEstimate, at: ScanAtKeyPose, number: int) -> Links:
         """Return a fix of a scan as one of its key pose, less what neighbouring ones share."""
@@ -219,7 +219,7 @@ class LoopMatcher:
         found += self._advanced(max(round(key_pose.length_m / PIECE_M), 1))
         links = [each for each in found if isinstance(each, Links)]
         refused = tuple(each for each in found if isinstance(each, str))
-        return ScanLinks(joined([Links.none(), *links]), refused)
+        return ScanLinks(joined_rows([Links.none(), *links]), refused)
 
     def resume(self, kept: Sequence[KeptScan], path_m: float, last_m: float) -> None:
         """Go on with what was kept before; a scan that was being compared is left out."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
-from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory, joined
+from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory, joined_rows
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.maps.field_map import Surveyed
@@ -322,7 +322,7 @@ class OnlineSlam:
     def _linked(self, key_pose: ArrivedKeyPose, found: ScanLinks) -> ArrivedKeyPose:
         for text in found.refused:
             self._report(EventKind.SCAN_REFUSED, text)
-        return replace(key_pose, links=joined([key_pose.links, found.links]), scans=())
+        return replace(key_pose, links=joined_rows([key_pose.links, found.links]), scans=())
 
     def _count(self, seen: int, used: int) -> None:
         """Report when the map explains few of the last readings, and when it does again."""

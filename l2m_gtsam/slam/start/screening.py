@@ -21,7 +21,7 @@ from numba import njit
 from scipy.ndimage import distance_transform_edt
 
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray, joined
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, joined_rows
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.parallel.threads import in_threads
@@ -396,5 +396,5 @@ def about_z(yaw: float) -> FloatArray:
 
 def best_of(parts: list[StartHypotheses]) -> StartHypotheses:
     """Return the hypotheses with the lowest scores, the best first."""
-    every = joined(parts)
+    every = joined_rows(parts)
     return every[np.argsort(every.score, kind="stable")[:MOST_KEPT]]

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from l2m_factors import M, X
-from l2m_gtsam.data import FloatArray, joined
+from l2m_gtsam.data import FloatArray, joined_rows
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.options import Options
@@ -330,7 +330,7 @@ class Explorer:
                 step = as_transform(past.T_anchor_key)
                 origin, found = past.anchor, seen_from_before(found, step, drift)
             parts.append(Links.single(origin, key_pose.number, found))
-        return replace(key_pose, links=joined(parts))
+        return replace(key_pose, links=joined_rows(parts))
 
     def _handing_over(self, section: OpenSection, last: int, path_m: float) -> Iterator[None]:
         """Marginalise the key poses up to the last but anchors, and begin another section."""

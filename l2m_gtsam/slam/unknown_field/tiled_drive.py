@@ -18,7 +18,7 @@ from l2m_factors import (
     tile_residual,
 )
 from l2m_gtsam.calibration.factor_graph import unit_priors
-from l2m_gtsam.data import FieldSample, FloatArray, IntArray, chosen_rows, joined
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray, chosen_rows, joined_rows
 from l2m_gtsam.slam.drive import KnownSensors, stacked
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, predict
 from l2m_gtsam.slam.pose_graph import successive
@@ -186,7 +186,7 @@ class TiledDrive:
         tiles = self.tiles
         parts = [tile.prediction(values.atVector(M(tile.number)), sensors) for tile in tiles]
         order = np.argsort(np.concatenate([tile.rows for tile in tiles]))
-        return chosen_rows(joined(parts), order)
+        return chosen_rows(joined_rows(parts), order)
 
     def penalties(
         self, noise: FloatArray, weights: FloatArray, squared: FloatArray

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
@@ -49,15 +48,6 @@ class Outcomes:
 
     def __len__(self) -> int:
         return len(self.survey)
-
-    @classmethod
-    def joined(cls, parts: "Sequence[Outcomes]") -> Self:
-        """Return the outcomes of all parts."""
-        return cls(
-            np.concatenate([part.error for part in parts]),
-            np.concatenate([part.covariance for part in parts]),
-            np.concatenate([part.survey for part in parts]),
-        )
 
     def solved(self) -> "Outcomes":
         """Return those that have a result."""

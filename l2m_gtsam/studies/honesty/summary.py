@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, joined_rows
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.honesty.cells import OFFSET, HonestyCell, Outcomes
 from l2m_gtsam.studies.honesty.drives import Condition, HonestyOptions
@@ -245,7 +245,7 @@ def honesty_summary(options: HonestyOptions, cells: Sequence[HonestyCell]) -> Ho
 
 def verdict(cells: Sequence[HonestyCell], uncertainty: Uncertainty) -> ConsistencyVerdict:
     """Return the verdict on the cells of one condition at one noise level."""
-    outcomes = Outcomes.joined([cell.outcomes(uncertainty) for cell in cells])
+    outcomes = joined_rows([cell.outcomes(uncertainty) for cell in cells])
     bound = np.concatenate([cell.bound for cell in cells])
     rows = outcomes.determined_rows()
     # Where the solve had enough readings, and the truth a few less, there is no bound.

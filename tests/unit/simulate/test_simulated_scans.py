@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.data import FloatArray, Trajectory, joined_rows
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.simulate.lidar import RayCaster, SpinningLidarOptions
@@ -55,7 +55,7 @@ def test_what_stands_in_front_hides_what_is_behind() -> None:
     R_map_post = Rotation.from_euler("Z", yaw).as_matrix()
     post = Solids(np.array([[*(2 * half), 3.0]]), np.array([[*centre, 1.5]]), R_map_post[None])
     p = np.array([2.0, 2.0, 1.0])
-    scan = snapshots(room().joined(post), EXACT, still(np.eye(3), p))[0]
+    scan = snapshots(joined_rows([room(), post]), EXACT, still(np.eye(3), p))[0]
     rays = EXACT.directions().reshape(-1, 3)
     # Slabs in the post's own plane: entered when the last of both is.
     start, ahead = (p[:2] - centre) @ R_map_post[:2, :2], rays[:, :2] @ R_map_post[:2, :2]
