@@ -10,7 +10,7 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.shifts import suite_errors, survey_poses
-from l2m_gtsam.mapping.suite_calibration import steady_survey, suite_doubts
+from l2m_gtsam.mapping.suite_calibration import refuse_stuck, steady_survey, suite_doubts
 from l2m_gtsam.maps.build import KINDS, build_map
 from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap, check_frame, framed
@@ -22,7 +22,7 @@ from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.recording.saturation import saturation_doubts
-from l2m_gtsam.recording.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
+from l2m_gtsam.recording.sync import SyncOptions, synchronise, with_offsets
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def suite_readings(
         offset = np.array([each.time_offset for each in known])
         synchronised = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0)))
         readings = synchronised.readings
-        _refuse_stuck(readings, recording)
+        refuse_stuck(readings, recording)
         readings = with_offsets(readings, recording.trajectory, offset)
         points, field = sensor_positions(readings, known), map_fields(readings, known)
         poses = survey_poses(recording.trajectory, readings, points, field, pose_noise)
@@ -203,16 +203,6 @@ def suite_readings(
     read = reduce(SurveyReadings.followed_by, drives)
     checked_readings(read.points, read.field)
     return read
-
-
-def _refuse_stuck(readings: Readings, recording: Recording) -> None:
-    """Raise a MapError for a sensor that reports one constant value: it would poison the map."""
-    if stuck := [readings.sensors[index] for index in stuck_sensors(readings)]:
-        msg = (
-            f"{recording.source.path}: the sensor {stuck[0]!r} is stuck on one value; choose the "
-            "others with `bag.fields`"
-        )
-        raise MapError(msg)
 
 
 def sensor_positions(readings: Readings, known: Sequence[KnownSensor]) -> FloatArray:

@@ -6,12 +6,11 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Trajectory
+from l2m_gtsam.mapping.suite_likelihood import field_slopes, place_slopes
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.maps.survey_poses import POSE, SurveyPoses
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions, pose_roots
 from l2m_gtsam.solve.linear_algebra import right_divided
-
-TIME = 15  # the column of the time offset
 
 
 def suite_errors(readings: Readings, known: Sequence[KnownSensor]) -> SuiteErrors:
@@ -26,27 +25,20 @@ def suite_errors(readings: Readings, known: Sequence[KnownSensor]) -> SuiteError
     """
     shift = np.zeros((len(readings), SHIFT, SIZE))
     for index, sensor in enumerate(known):
-        rows = readings.rows_of(index)
-        shift[rows] = sensor_shift(readings, rows, sensor)
+        rows = np.arange(len(readings))[readings.rows_of(index)]
+        shift[rows] = sensor_shift(readings[rows], sensor)
     names, every = tuple(each.sensor for each in known), np.arange(len(readings))
     return SuiteErrors(names, suite_covariance(known), every, readings.sensor, shift)
 
 
-def sensor_shift(readings: Readings, rows: slice, sensor: KnownSensor) -> FloatArray:
-    """Return the derivatives of (x, y) by the errors of the sensor that read rows, (n, 6, 16)."""
+def sensor_shift(readings: Readings, sensor: KnownSensor) -> FloatArray:
+    """Return the derivatives of (x, y) by the errors of the sensor that read, (n, 6, 16)."""
     if readings.motion is None:
         raise ValueError("the readings have no motion, so that no clock can be judged")
-    R, twist = readings.R_map_lidar[rows], readings.motion.twist_lidar[rows]
-    b_lidar = sensor.distortion.undo(readings.field[rows])
-    undone = right_divided(R, sensor.distortion.C)
-    shift = np.zeros((len(R), SHIFT, SIZE))
-    shift[:, :3, :3] = R
-    velocity = np.cross(twist[:, :3], sensor.t_lidar_mag) + twist[:, 3:]
-    shift[:, :3, TIME] = np.einsum("nij,nj->ni", R, velocity)
-    shift[:, 3:, 3:12] = -np.einsum("nij,nk->nijk", undone, b_lidar).reshape(-1, 3, 9)
-    shift[:, 3:, 12:TIME] = -undone
-    shift[:, 3:, TIME] = np.einsum("nij,nj->ni", R, np.cross(twist[:, :3], b_lidar))
-    return shift
+    turned = right_divided(readings.R_map_lidar, sensor.distortion.C)
+    b_lidar = sensor.distortion.undo(readings.field)
+    of_places = place_slopes(readings, sensor.t_lidar_mag)
+    return np.concatenate([of_places, field_slopes(readings, turned, b_lidar)], axis=1)
 
 
 def suite_covariance(known: Sequence[KnownSensor]) -> FloatArray:

@@ -18,6 +18,7 @@ from l2m_gtsam.mapping.suite_solver import (
     SuiteStep,
     first_step,
     prior_information,
+    prior_sigma,
     solve_suite,
 )
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -232,14 +233,19 @@ def suite_drive(
     reach = REACH * options.clock_s + max(stated, default=0.0)
     synchronised = synchronise(recording, options.sync, reach)
     readings = synchronised.readings
-    if stuck := [readings.sensors[index] for index in stuck_sensors(readings)]:
-        raise MapError(
-            f"{recording.source.path}: the sensor {stuck[0]!r} is stuck on one value; choose the "
-            "others with `bag.fields`"
-        )
+    refuse_stuck(readings, recording)
     known = [(assumed or {}).get(name, KnownSensor.ideal(name)) for name in readings.sensors]
     start = np.stack([_parameters(each) for each in known])
     return SuiteDrive(recording, readings, synchronised.counts, start)
+
+
+def refuse_stuck(readings: Readings, recording: Recording) -> None:
+    """Raise a MapError for a sensor that reports one constant value: it would poison the map."""
+    if stuck := stuck_sensors(readings):
+        raise MapError(
+            f"{recording.source.path}: the sensor {readings.sensors[stuck[0]]!r} is stuck on one "
+            "value; choose the others with `bag.fields`"
+        )
 
 
 def _parameters(sensor: KnownSensor) -> FloatArray:
@@ -362,9 +368,7 @@ def _doubts(
 ) -> tuple[str, ...]:
     """Return the parameters that the drive hardly determines, a sentence for each sensor."""
     sigma = np.sqrt(np.diag(solution.last.covariance)).reshape(len(names), SIZE)
-    assumed = np.repeat(
-        [options.position_m, options.matrix, options.offset_ut, options.clock_s], [3, 9, 3, 1]
-    )
+    assumed = prior_sigma(options)
     sentences = []
     for name, own in zip(names, sigma, strict=True):
         if weak := [PARAMETERS[k] for k in np.flatnonzero(own > UNDETERMINED * assumed)]:

@@ -197,9 +197,10 @@ def window_slopes(window: SuiteWindow, sensors: FloatArray, prior: Hyperparamete
     normal = normal_of(basis, TrainingSet(points, undone.field, np.ones(len(readings))))
     found, D = evidence(normal, log_variance, prior.noise), np.exp(0.5 * log_variance)
     predicted, gradient = basis.field_and_gradient(points, D * found.mean)
-    places = _wide(_place_slopes(readings, undone), readings.sensor, len(sensors))
+    places = _wide(place_slopes(readings, undone.lever), readings.sensor, len(sensors))
     places -= places.mean(axis=0)
-    J = _wide(_field_slopes(readings, undone), readings.sensor, len(sensors)) - gradient @ places
+    own = field_slopes(readings, undone.turned, undone.b)
+    J = _wide(own, readings.sensor, len(sensors)) - gradient @ places
     r = undone.field - predicted
     return WindowSlopes(basis, prior.noise, undone, points, found, D, r, gradient, places, J)
 
@@ -218,11 +219,11 @@ def late_slopes(
     sensors
         S.
     """
-    readings = window.readings
+    readings, undone = window.readings, at.undone
     own = np.where(readings.sensor[:, None] == np.arange(sensors), late[:, None], 0.0)[:, None]
-    places = _place_slopes(readings, at.undone)[:, :, TAU, None] * own
+    places = place_slopes(readings, undone.lever)[:, :, TAU, None] * own
     places -= places.mean(axis=0)
-    fields = _field_slopes(readings, at.undone)[:, :, TAU, None] * own
+    fields = field_slopes(readings, undone.turned, undone.b)[:, :, TAU, None] * own
     return np.asarray(fields - at.gradient @ places)
 
 
@@ -245,24 +246,30 @@ def _wide(own: FloatArray, sensor: IntArray, count: int) -> FloatArray:
     return wide.reshape(len(own), 3, -1)
 
 
-def _place_slopes(readings: Readings, undone: Undistorted) -> FloatArray:
-    """Return derivatives of the sensors' places by their parameters, shape (N, 3, 16)."""
+def place_slopes(readings: Readings, lever: FloatArray) -> FloatArray:
+    """Return derivatives of the places of readings by their sensors' parameters, (N, 3, 16).
+
+    ``lever`` is where the sensors are in the lidar frame, shape (N, 3) or (3,).
+    """
     R, J = readings.R_map_lidar, np.zeros((len(readings), 3, SIZE))
     J[:, :, T] = R
     if readings.motion is not None:
         w, v = readings.motion.twist_lidar[:, :3], readings.motion.twist_lidar[:, 3:]
-        J[:, :, TAU] = np.einsum("nij,nj->ni", R, v + np.cross(w, undone.lever))
+        J[:, :, TAU] = np.einsum("nij,nj->ni", R, v + np.cross(w, lever))
     return J
 
 
-def _field_slopes(readings: Readings, undone: Undistorted) -> FloatArray:
-    """Return derivatives of the undistorted fields by the sensors' parameters, (N, 3, 16)."""
+def field_slopes(readings: Readings, turned: FloatArray, b: FloatArray) -> FloatArray:
+    """Return derivatives of undistorted fields b by their sensors' parameters, (N, 3, 16).
+
+    ``turned`` takes a change of a reading to that of its field in the map frame, (N, 3, 3).
+    """
     J = np.zeros((len(readings), 3, SIZE))
-    J[:, :, C] = -(undone.turned[:, :, :, None] * undone.b[:, None, None, :]).reshape(-1, 3, 9)
-    J[:, :, H] = -undone.turned
+    J[:, :, C] = -(turned[:, :, :, None] * b[:, None, None, :]).reshape(-1, 3, 9)
+    J[:, :, H] = -turned
     if readings.motion is not None:
         w = readings.motion.twist_lidar[:, :3]
-        J[:, :, TAU] = np.einsum("nij,nj->ni", readings.R_map_lidar, np.cross(w, undone.b))
+        J[:, :, TAU] = np.einsum("nij,nj->ni", readings.R_map_lidar, np.cross(w, b))
     return J
 
 

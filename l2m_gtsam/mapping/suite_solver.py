@@ -299,16 +299,15 @@ def likeness(windows: SuiteWindows, residuals: Sequence[FloatArray]) -> float:
     return max(2 * float(correlation_of(np.concatenate(parts), rows).sum()) - 1, 1.0)
 
 
+def prior_sigma(options: SuiteCalibrationOptions) -> FloatArray:
+    """Return the standard deviations that are assumed of a sensor's parameters, shape (16,)."""
+    sigmas = [options.position_m, options.matrix, options.offset_ut, options.clock_s]
+    return np.repeat(sigmas, [3, 9, 3, 1])
+
+
 def prior_information(count: int, options: SuiteCalibrationOptions) -> FloatArray:
     """Return the information about so many sensors that is assumed, shape (16 S, 16 S)."""
-    sigma = np.concatenate(
-        [
-            np.full(3, options.position_m),
-            np.full(9, options.matrix),
-            np.full(3, options.offset_ut),
-            [options.clock_s],
-        ]
-    )
+    sigma = prior_sigma(options)
     scale = np.zeros((count, SIZE))
     scale[:, DIAGONAL] = 1 / (count * len(DIAGONAL))
     fixed = np.outer(scale, scale) / SAME_SCALE**2

@@ -6,8 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Trajectory
 from l2m_gtsam.mapping.map_building import map_fields, sensor_positions
-from l2m_gtsam.mapping.shifts import TIME, suite_covariance, suite_errors
+from l2m_gtsam.mapping.shifts import suite_covariance, suite_errors
 from l2m_gtsam.mapping.suite_calibration import errors_in_common
+from l2m_gtsam.mapping.suite_likelihood import TAU
 from l2m_gtsam.maps.suite_errors import SIZE
 from l2m_gtsam.recording.sync import TWIST_S, with_offsets
 
@@ -68,13 +69,13 @@ def test_shifts_are_the_derivatives_of_what_a_map_is_given() -> None:
     shift = suite_errors(moving, sensors).shift
     for k in range(SIZE):
         # A velocity is that over a while.
-        step = TWIST_S / 2 if k == TIME else STEP
+        step = TWIST_S / 2 if k == TAU else STEP
         plus, minus = (
             given(bare, [with_error(each, k, sign * step) for each in sensors]) for sign in (1, -1)
         )
         slope = (plus - minus) / (2 * step)
         # Second differences: of a step of 1e-5 of numbers up to a hundred, of 0.05 s with 2 rad/s.
-        within = 1e-2 if k == TIME else 1e-5
+        within = 1e-2 if k == TAU else 1e-5
         np.testing.assert_allclose(shift[:, :, k], slope, atol=within * (1 + np.abs(slope).max()))
 
 
