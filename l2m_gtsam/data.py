@@ -342,6 +342,11 @@ class Readings:
         low, high = np.searchsorted(self.sensor, [index, index + 1])
         return slice(int(low), int(high))
 
+    def alone(self, index: int) -> "Readings":
+        """Return the readings of the sensor with this index, as of the only one."""
+        own = self[np.arange(len(self))[self.rows_of(index)]]
+        return replace(own, sensors=(self.sensors[index],), sensor=np.zeros_like(own.sensor))
+
 
 @dataclass(frozen=True)
 class SaturatedAxis:

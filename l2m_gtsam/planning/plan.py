@@ -136,7 +136,7 @@ def plan(
     read = np.unique(readings.sensor).tolist()
     least = max(read, key=lambda index: worsts[index].badness)
     # The other sensors are known better: what a motion does for them need not be asked.
-    one, alone = task.of(least), only(readings, least)
+    one, alone = task.of(least), readings.alone(least)
     motions = _with_motions(one, alone, _motions(alone, solver_map, planning), progress)
     return DrivePlan(
         sensors=sensors,
@@ -169,12 +169,6 @@ def assumed_recording(
     silent = np.zeros((len(stamps), 3))
     series = tuple(FieldSeries(name, "", "", stamps, silent) for name in sensors)
     return Recording(trajectory, series, source)
-
-
-def only(readings: Readings, sensor: int) -> Readings:
-    """Return the readings of one sensor, as the only one."""
-    own = readings[np.flatnonzero(readings.sensor == sensor)]
-    return replace(own, sensors=(readings.sensors[sensor],), sensor=np.zeros_like(own.sensor))
 
 
 def with_motion(readings: Readings, motion: ExtraMotion) -> Readings:

@@ -113,13 +113,21 @@ class KnownCalibration:
 
     def estimate(self) -> Estimate:
         """Return it as an estimate of a single sensor."""
-        return Estimate(
-            t=self.vector[None, :3],
-            distortion=self.vector[None, 3:15],
-            noise=np.array([self.noise]),
-            ridge=np.zeros(1),
-            offset=self.vector[15:],
-        )
+        return estimate_of(self.vector[None], np.array([self.noise]))
+
+
+def estimate_of(vectors: FloatArray, noise: FloatArray) -> Estimate:
+    """Return S sensors as a solve has them.
+
+    Parameters
+    ----------
+    vectors
+        t, C row by row, H and time offset of each, shape (S, 16).
+    noise
+        Standard deviation of each one's noise in uT, shape (S,).
+    """
+    ridge = np.zeros(len(vectors))
+    return Estimate(vectors[:, :3], vectors[:, 3:15], noise, ridge, vectors[:, 15])
 
 
 def knows_its_errors(field_map: QueryableMap) -> bool:

@@ -36,7 +36,7 @@ from l2m_gtsam.records.validation import (
 )
 from l2m_gtsam.solve.correction import without_moving
 from l2m_gtsam.validation.figures import Thinning, doubts_and_notes, offset_s, sensor_figures
-from l2m_gtsam.validation.innovation import KnownCalibration
+from l2m_gtsam.validation.innovation import KnownCalibration, estimate_of
 from l2m_gtsam.validation.places import (
     PlaceOrVehicle,
     is_elsewhere,
@@ -223,13 +223,7 @@ def _of_all(test: _Test, known: Sequence[SensorCalibration]) -> tuple[Readings, 
     parts = [drive_of(test.readings, test.recording, each).at(offset_s(each)) for each in known]
     calibrations = [_known(test.recording, each) for each in known]
     vectors = np.array([each.vector for each in calibrations])
-    estimate = Estimate(
-        t=vectors[:, :3],
-        distortion=vectors[:, 3:15],
-        noise=np.array([each.noise for each in calibrations]),
-        ridge=np.zeros(len(known)),
-        offset=vectors[:, 15],
-    )
+    estimate = estimate_of(vectors, np.array([each.noise for each in calibrations]))
     readings = together(parts, names)
     inside = test.field_map.query(places_of(readings, estimate.t)).inside
     return readings.select(inside), estimate
@@ -256,9 +250,7 @@ def drive_of(readings: Readings, recording: Recording, sensor: SensorCalibration
     ConfigError
         Such a number was not recorded.
     """
-    index = readings.sensors.index(sensor.sensor)
-    own = readings[np.arange(len(readings))[readings.rows_of(index)]]
-    own = replace(own, sensors=(sensor.sensor,), sensor=np.zeros(len(own), dtype=np.int64))
+    own = readings.alone(readings.sensors.index(sensor.sensor))
     names = [each.name for each in recording.scalars]
     if unknown := [each.name for each in sensor.moving if each.name not in names]:
         raise ConfigError(

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.data import FloatArray, IntArray, chosen_rows
 from l2m_gtsam.recording.sync import with_offsets
@@ -21,6 +20,7 @@ from l2m_gtsam.studies.honesty.drives import (
 )
 from l2m_gtsam.studies.json_arrays import JsonFloats
 from l2m_gtsam.studies.methods import bound_at
+from l2m_gtsam.validation.innovation import estimate_of
 
 PARAMETERS = 16
 OFFSET = slice(15, 16)
@@ -165,17 +165,6 @@ def bound_of(hall: MappedHall, disturbed: Disturbed, options: OneKeyOptions) -> 
     readings = drive.readings.select(disturbed.change == 0)
     if readings.motion is not None:
         readings = with_offsets(readings, drive.trajectory, drive.offset)
-    truth = true_estimate(drive.truth(), hall.noise)
+    vectors = drive.truth()
+    truth = estimate_of(vectors, np.full(len(vectors), hall.noise))
     return bound_at(readings, hall.field_map, truth, options)
-
-
-def true_estimate(truth: FloatArray, noise: float) -> Estimate:
-    """Return the estimate of S sensors that is true; rows as of ``Outcomes``, shape (S, 16)."""
-    nothing = np.zeros(len(truth))
-    return Estimate(
-        t=truth[:, :3],
-        distortion=truth[:, 3:15],
-        noise=np.full(len(truth), noise),
-        ridge=nothing,
-        offset=truth[:, 15],
-    )
