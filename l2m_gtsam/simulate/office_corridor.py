@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from l2m_gtsam.data import BoolArray, FloatArray, joined_rows
+from l2m_gtsam.storage.cloud import thinned_cloud
 
 MICROTESLA = 0.1  # of a pole of 1 A m at a metre: mu0 / 4 pi
 EARTH = np.array([17.0, -9.0, -44.0])  # uT
@@ -105,10 +106,7 @@ class OfficeCorridor:
 
     def cloud(self) -> FloatArray:
         """Return what a LiDAR saw of the steel, shape (M, 3), metres."""
-        points = np.concatenate([self.rods.seen(), self.sheets.seen()])
-        cell = np.unique(np.floor(points / VOXEL_M), axis=0, return_inverse=True)[1]
-        weight = np.bincount(cell)
-        return np.column_stack([np.bincount(cell, axis) / weight for axis in points.T])
+        return thinned_cloud(np.concatenate([self.rods.seen(), self.sheets.seen()]), VOXEL_M)
 
     def height(self, xy: FloatArray) -> FloatArray:
         """Return the height of the floor at places (N, 2) in metres, shape (N,)."""

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, FloatArray, joined_rows
 from l2m_gtsam.simulate.world import SteelWorld
+from l2m_gtsam.storage.cloud import thinned_cloud
 
 MILD, STRONG = 1.0, 10.0  # factors on the polarisation of posts and racks
 EARTH = np.array([22.0, 3.0, -38.0])  # uT
@@ -69,7 +70,7 @@ class SteelStructure:
             _surface(dimensions) + centre + shift
             for dimensions, centre in zip(self.boxes.dimensions, self.boxes.centres, strict=True)
         ]
-        return _voxels(np.concatenate(surfaces))
+        return thinned_cloud(np.concatenate(surfaces), VOXEL_M)
 
 
 def floor_steel(rng: np.random.Generator) -> Boxes:
@@ -152,13 +153,6 @@ def _surface(dimensions: FloatArray) -> FloatArray:
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     # The outermost grid lines are the sides to rounding.
     return np.asarray(grid[np.any(np.abs(grid) > dimensions / 2 - 1e-9, axis=1)])
-
-
-def _voxels(points: FloatArray) -> FloatArray:
-    """Return the mean of the points in each voxel, shape (P, 3)."""
-    _, voxel = np.unique(np.floor(points / VOXEL_M), axis=0, return_inverse=True)
-    count = np.bincount(voxel)
-    return np.stack([np.bincount(voxel, points[:, k]) / count for k in range(3)], axis=1)
 
 
 class CloudVariant(StrEnum):
