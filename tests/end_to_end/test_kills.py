@@ -12,8 +12,8 @@ import pytest
 
 from l2m_gtsam.storage.result_set import SET_FILE
 from tests.fuzz.corpus import make_demo
-from tests.fuzz.kills import kill_all, killed
-from tests.fuzz.trials import BAD, Command, commands, files, prepared, table
+from tests.fuzz.kills import killed
+from tests.fuzz.trials import BAD, Command, break_all, commands, files, prepared, table
 
 FILES = Path(__file__).parents[1] / "files"
 KILLS = 4  # of a command that takes half a second
@@ -48,6 +48,6 @@ def test_seconds_of_a_run_are_no_results(tmp_path: Path) -> None:
 @pytest.mark.study
 def test_kills_at_random_moments(tmp_path: Path) -> None:
     make_demo(tmp_path / "demo")
-    found = kill_all(commands(tmp_path, tmp_path / "demo"), ALL, tmp_path, seed=0)
+    found = break_all(killed, commands(tmp_path, tmp_path / "demo"), ALL, tmp_path, seed=0)
     print(table(found))
     assert not {left for _, left in found} & set(BAD)

@@ -90,9 +90,13 @@ def ended(case: Case, keep: Path | None = None) -> Ended:
 
 def table(ends: Counter[tuple[str, str]]) -> str:
     """Return how many cases of each kind ended how, as a table in Markdown."""
+    return markdown(ends, ("file", "cases"), [*GOOD.values(), *BAD])
+
+
+def markdown(ends: Counter[tuple[str, str]], head: tuple[str, str], columns: Sequence[str]) -> str:
+    """Return how often each kind ended how, with a sum; ``head`` names the kinds and the sums."""
     kinds = list(dict.fromkeys(kind for kind, _ in ends))
-    columns = [*GOOD.values(), *BAD]
-    rows = [["file", "cases", *columns], ["---"] * (len(columns) + 2)]
+    rows = [[*head, *columns], ["---"] * (len(columns) + 2)]
     for kind in [*kinds, "all"]:
         counts = [
             sum(

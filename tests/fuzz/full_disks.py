@@ -6,8 +6,7 @@
 import os
 import shutil
 import subprocess
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from random import Random
@@ -15,15 +14,13 @@ from random import Random
 from tests.fuzz.trials import (
     NEW,
     OLD,
-    Command,
     Prepared,
     asked_for,
+    break_all,
     hidden,
     next_run,
-    prepared,
     start,
     state,
-    table,
     told,
 )
 
@@ -92,27 +89,10 @@ def _taken(folder: Path) -> int:
     return sum(-(-size // PAGE) * PAGE for size in sizes)
 
 
-def fill_all(
-    chosen: Sequence[Command], disks: int, folder: Path, seed: int
-) -> Counter[tuple[str, str]]:
-    """Fill disks under commands by their shares; return how often each left what."""
-    found: Counter[tuple[str, str]] = Counter()
-    whole = sum(each.share for each in chosen)
-    for command in chosen:
-        trial = prepared(command, folder / command.name.replace(" ", "_"))
-        shutil.copytree(trial.there, trial.folder / "after")
-        for number in range(max(1, round(disks * command.share / whole))):
-            left, wrong = filled(trial, Random(f"{seed} {command.name} {number}"))  # noqa: S311 - repeatable
-            found[command.name, left] += 1
-            print(f"{number}: {command.name}: {left} {wrong}", flush=True)
-        (folder / "table.md").write_text(table(found))
-    return found
-
-
 def main() -> None:
     """Fill as the command line asks."""
     chosen, asked = asked_for("disks", 20, __doc__)
-    told(fill_all(chosen, asked.times, asked.out, asked.seed))
+    told(break_all(filled, chosen, asked.times, asked.out, asked.seed))
 
 
 if __name__ == "__main__":

@@ -7,26 +7,21 @@ seed, and prints a table.
 import os
 import shutil
 import signal
-from collections import Counter
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from random import Random
 from time import monotonic, sleep
 
 from tests.fuzz.trials import (
-    BAD,
     MOST_S,
     NEW,
     OLD,
-    Command,
     Prepared,
     asked_for,
+    break_all,
     hidden,
     next_run,
-    prepared,
     start,
     state,
-    table,
     told,
 )
 
@@ -66,28 +61,10 @@ def _await(number: int, is_time: Callable[[], bool], most_s: float) -> None:
         sleep(LOOK_AGAIN_S)  # between looks: what a process has written is seen in files alone
 
 
-def kill_all(
-    chosen: Sequence[Command], kills: int, folder: Path, seed: int
-) -> Counter[tuple[str, str]]:
-    """Kill commands by their shares; return how often each left what."""
-    found: Counter[tuple[str, str]] = Counter()
-    whole = sum(each.share for each in chosen)
-    for command in chosen:
-        trial = prepared(command, folder / command.name.replace(" ", "_"))
-        print(f"{command.name}: {trial.seconds:.1f} s, {len(trial.new)} files", flush=True)
-        for number in range(round(kills * command.share / whole)):
-            left, wrong = killed(trial, Random(f"{seed} {command.name} {number}"))  # noqa: S311 - repeatable
-            found[command.name, left] += 1
-            if left in BAD:
-                print(f"{number}: {command.name}: {left}: {wrong}", flush=True)
-        (folder / "table.md").write_text(table(found))
-    return found
-
-
 def main() -> None:
     """Kill as the command line asks."""
     chosen, asked = asked_for("kills", 200, __doc__)
-    told(kill_all(chosen, asked.times, asked.out, asked.seed))
+    told(break_all(killed, chosen, asked.times, asked.out, asked.seed))
 
 
 if __name__ == "__main__":

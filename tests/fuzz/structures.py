@@ -5,7 +5,6 @@ import sqlite3
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -226,12 +225,3 @@ def changed_archive(data: bytes, random: Random) -> bytes:
                     name = str(random.choice(VALUES))[:100] or "x"
             target.writestr(name, content, packing)
     return into.getvalue()
-
-
-STRUCTURES: dict[str, tuple[Callable[[bytes, Random], bytes], ...]] = {
-    ".bag": (changed_ros1,),
-    ".mcap": (changed_mcap,),
-    ".db3": (changed_db3,),
-    "map.npz": (changed_map, changed_archive),
-    "cloud.npz": (changed_cloud, changed_archive),
-}

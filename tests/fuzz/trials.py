@@ -8,15 +8,17 @@ import re
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from random import Random
 from time import monotonic
 from typing import NoReturn
 
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.storage.result_set import SET_FILE, check_set
 from tests.drives.fleets import CONFIG, make_place, vehicle
+from tests.fuzz.cases import markdown
 from tests.fuzz.corpus import make_demo
 from tests.fuzz.runner import GOOD, start_command
 from tests.support.command_line import l2m
@@ -149,6 +151,7 @@ def prepared(command: Command, folder: Path) -> Prepared:
         complete(command.words, there)
         runs.append(files(there))
     seconds = monotonic() - begun
+    shutil.copytree(there, folder / "after")
     assert runs[0] != old, "before and after are the same"
     assert runs[0].keys() == runs[1].keys()
     varying = frozenset(name for name, digest in runs[0].items() if runs[1][name] != digest)
@@ -263,17 +266,8 @@ def complete(words: Sequence[str], there: Path) -> None:
 
 def table(found: Counter[tuple[str, str]]) -> str:
     """Return how often each command left what, in Markdown."""
-    names = list(dict.fromkeys(name for name, _ in found))
     seen = dict.fromkeys(left for _, left in sorted(found))
-    columns = [*(each for each in seen if each not in BAD), *BAD]
-    rows = [["command", "runs", *columns], ["---"] * (len(columns) + 2)]
-    for command in [*names, "all"]:
-        counts = [
-            sum(n for (name, left), n in found.items() if left == each and command in (name, "all"))
-            for each in columns
-        ]
-        rows.append([command, *map(str, (sum(counts), *counts))])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
+    return markdown(found, ("command", "runs"), [*(each for each in seen if each not in BAD), *BAD])
 
 
 def asked_for(what: str, usual: int, about: str) -> tuple[list[Command], argparse.Namespace]:
@@ -290,6 +284,28 @@ def asked_for(what: str, usual: int, about: str) -> tuple[list[Command], argpars
     asked.out.mkdir(parents=True)
     chosen = commands(asked.out, asked.demo.resolve())
     return [each for each in chosen if not asked.only or each.name in asked.only], asked
+
+
+def break_all(
+    once: Callable[[Prepared, Random], tuple[str, str]],
+    chosen: Sequence[Command],
+    times: int,
+    folder: Path,
+    seed: int,
+) -> Counter[tuple[str, str]]:
+    """Break commands off, as often as their shares say; return how often each left what."""
+    found: Counter[tuple[str, str]] = Counter()
+    whole = sum(each.share for each in chosen)
+    for command in chosen:
+        trial = prepared(command, folder / command.name.replace(" ", "_"))
+        print(f"{command.name}: {trial.seconds:.1f} s, {len(trial.new)} files", flush=True)
+        for number in range(max(1, round(times * command.share / whole))):
+            left, wrong = once(trial, Random(f"{seed} {command.name} {number}"))  # noqa: S311 - repeatable
+            found[command.name, left] += 1
+            if left in BAD:
+                print(f"{number}: {command.name}: {left}: {wrong}", flush=True)
+        (folder / "table.md").write_text(table(found))
+    return found
 
 
 def told(found: Counter[tuple[str, str]]) -> NoReturn:

@@ -19,10 +19,8 @@ PACKERS: dict[str, Callable[[bytes], bytes]] = {
 }
 MAGIC_ROS1 = b"#ROSBAG V2.0\n"
 MAGIC_MCAP = b"\x89MCAP0\r\n"
-HEADER_ROS1 = 4096  # bytes of the first record of a bag of ROS 1
 BAG, CHUNK_INFO, CHUNK = b"\x03", b"\x06", b"\x05"
 MCAP_CHUNK, MCAP_FOOTER, MCAP_INDEX = 0x06, 0x02, 0x08
-SUMMARY = (0x03, 0x04, 0x08, 0x0A, 0x0B, 0x0D, 0x0E)  # what the summary of an mcap file repeats
 
 
 @dataclass(frozen=True)
