@@ -8,20 +8,10 @@ import pytest
 from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.exports.formats import FORMATS
-from tests.drives.yard import T_LIDAR_MAG, C, CalibratedYard, calibrated, calibrated_yard
+from tests.drives.yard import T_LIDAR_MAG, C, CalibratedYard, calibrated
 from tests.support.command_line import complaint_here, l2m
 
 pytestmark = pytest.mark.usefixtures("without_pages")
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> CalibratedYard:
-    return calibrated_yard(tmp_path_factory)
-
-
-@pytest.fixture(scope="module")
-def calibration(place: CalibratedYard) -> Path:
-    return place.calibration
 
 
 def test_a_calibrated_bag_calibrates_to_nothing(

@@ -8,19 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
 from tests.drives.bags import Entry, ros, write
-from tests.drives.yard import calibrated_yard
 from tests.support.command_line import complaint_here, l2m
 from tests.worlds.yard import START, STEP, Yard, route
-
-
-@pytest.fixture(scope="module")
-def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
-    return calibrated_yard(tmp_path_factory).yard
-
-
-@pytest.fixture(scope="module")
-def field_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return calibrated_yard(tmp_path_factory).map
 
 
 def poses_only(folder: Path, places: FloatArray) -> Path:
@@ -62,9 +51,9 @@ def test_a_parked_vehicle(yard: Yard, field_map: Path, tmp_path: Path) -> None:
     assert "(15 parameters not determined; with it " in out
 
 
-@pytest.mark.parametrize("place", ["1,2", "a,b,c", "1,2,nan", ""])
-def test_a_place_that_is_none(yard: Yard, place: str, tmp_path: Path) -> None:
-    line = complaint_here("plan", yard.west, "--map", tmp_path / "map.npz", "--at", place)
+@pytest.mark.parametrize("at", ["1,2", "a,b,c", "1,2,nan", ""])
+def test_a_place_that_is_none(yard: Yard, at: str, tmp_path: Path) -> None:
+    line = complaint_here("plan", yard.west, "--map", tmp_path / "map.npz", "--at", at)
     assert "accepted: three numbers, x,y,z in metres" in line
 
 

@@ -11,23 +11,12 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.records.sensor_models import Model
 from l2m_gtsam.storage.calibration_file import read_calibration
 from tests.drives.bags import Entry, ros, write
-from tests.drives.yard import calibrated_yard
 from tests.support.command_line import complaint_here, l2m
 from tests.worlds.yard import NOISE, START, STEP, Yard, route, world
 
 pytestmark = pytest.mark.usefixtures("without_pages")
 
 H = np.array([0.8, -0.5, 0.6])  # uT/A
-
-
-@pytest.fixture(scope="module")
-def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
-    return calibrated_yard(tmp_path_factory).yard
-
-
-@pytest.fixture(scope="module")
-def field_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return calibrated_yard(tmp_path_factory).map
 
 
 @pytest.fixture(scope="module")

@@ -13,13 +13,8 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.map_file import load_map, save_map
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
-from tests.drives.yard import CalibratedYard, calibrated_yard
+from tests.drives.yard import CalibratedYard
 from tests.support.command_line import complaint_here, l2m
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> CalibratedYard:
-    return calibrated_yard(tmp_path_factory)
 
 
 @pytest.fixture

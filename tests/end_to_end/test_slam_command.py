@@ -21,7 +21,6 @@ from l2m_gtsam.storage.record_files import read_slam
 from l2m_gtsam.storage.trajectory_files import write_tum
 from l2m_gtsam.text import significant
 from tests.drives.calibrations import calibration, sensor
-from tests.drives.yard import calibrated_yard
 from tests.support.command_line import complaint_here, l2m
 from tests.support.left_out import no_pages
 from tests.worlds.yard import NOISE, Yard, route, survey
@@ -29,16 +28,6 @@ from tests.worlds.yard import NOISE, Yard, route, survey
 LINE = len(route(-3, 0.5)) // 11
 NEXT_TO_POST = route(-3, 0.5)[3 * LINE : 8 * LINE]
 SIGMA = np.concatenate([np.full(3, 0.01), np.full(9, 0.01), np.full(3, 1.0)])
-
-
-@pytest.fixture(scope="module")
-def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
-    return calibrated_yard(tmp_path_factory).yard
-
-
-@pytest.fixture(scope="module")
-def field_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return calibrated_yard(tmp_path_factory).map
 
 
 @pytest.fixture(scope="module")

@@ -14,25 +14,10 @@ from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.record_files import read_validation
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
-from tests.drives.yard import CalibratedYard, H, calibrated_yard, written
+from tests.drives.yard import CalibratedYard, H, written
 from tests.support.command_line import complaint_here, l2m
 from tests.support.map_files import copy_map
 from tests.worlds.yard import NOISE
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> CalibratedYard:
-    return calibrated_yard(tmp_path_factory)
-
-
-@pytest.fixture(scope="module")
-def calibration(place: CalibratedYard) -> Path:
-    return place.calibration
-
-
-@pytest.fixture(scope="module")
-def field_map(place: CalibratedYard) -> Path:
-    return place.map
 
 
 def changed_file(calibration: Path, path: Path, **changes: object) -> Path:

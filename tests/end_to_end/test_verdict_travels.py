@@ -24,7 +24,7 @@ from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
 from l2m_gtsam.storage.open_bag import open_bag
 from l2m_gtsam.storage.record_files import read_validation
-from tests.drives.yard import CalibratedYard, calibrated_yard, written
+from tests.drives.yard import CalibratedYard, written
 from tests.support.command_line import Finished, ended, l2m, one_line
 from tests.support.one_process import computed_here
 
@@ -44,11 +44,6 @@ THRESHOLDS: dict[str, dict[str, Any]] = {
     "warn": {**LAX, "position_sigma_m": {"warn": 1e-9, "fail": 1e6}},
     "other warn": {**LAX, "hard_iron_sigma_ut": {"warn": 1e-9, "fail": 1e6}},
 }
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> CalibratedYard:
-    return calibrated_yard(tmp_path_factory)
 
 
 def config(folder: Path, name: str) -> Path:
