@@ -24,6 +24,7 @@ from l2m_gtsam.errors import BagError, ConfigError, L2MError, NoRoomError, Outpu
 from l2m_gtsam.progress import silent
 from l2m_gtsam.qa.fleet import sensor_rows
 from l2m_gtsam.records.fleet import DATE, Computation, DriveOutcome, RowKey
+from l2m_gtsam.records.provenance import in_utc
 from l2m_gtsam.storage.drive_lists import (
     ManifestEntry,
     find_bags,
@@ -298,7 +299,7 @@ def _calibrated(task: FleetTask, opened: OpenMap, saved: SavedMap, begun: float)
         verdict = report_calibration(stage, found, task.config.qa)
         outcome = DriveOutcome(
             key=task.key(recording.source.sha256),
-            start=_start(recording),
+            start=in_utc(int(recording.trajectory.stamp_ns[0])),
             duration=_duration(recording),
             sensors=sensor_rows(found.result, verdict),
             error="",
@@ -358,11 +359,6 @@ def digest_of(path: Path) -> str:
         return source_file(path).sha256
     except L2MError:
         return ""
-
-
-def _start(recording: Recording) -> str:
-    seconds = int(recording.trajectory.stamp_ns[0]) // NANOSECONDS
-    return datetime.fromtimestamp(seconds, UTC).strftime(DATE)
 
 
 def _duration(recording: Recording) -> float:

@@ -1,7 +1,6 @@
 """Point clouds, drift and true poses in simulated bags, read back as a user's would be."""
 
 import json
-import tracemalloc
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from l2m_gtsam.storage.bag import read_recording, read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions as ReadOptions
 from l2m_gtsam.storage.cloud import thinned_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, read_cloud_topic
+from tests.support.memory import with_peak
 
 SMALL: dict[str, Any] = {
     "floor_plan": {"length": 16.0, "width": 9.0, "rack_rows": 1, "blocks": 1},
@@ -188,12 +188,7 @@ def test_scans_are_written_one_by_one(tmp_path: Path, kind: BagKind) -> None:
     drive = made(lidar=json.dumps({"columns": 450, "rate": 1.0})).calibration
     assert drive.scans is not None
     size = sum(12 * len(scan) for scan in drive.scans)
-    tracemalloc.start()
-    try:
-        written(tmp_path, kind, drive)
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
+    _, peak = with_peak(lambda: written(tmp_path, kind, drive))
     assert size > 7.5e6
     # A scan of 15,000 rays in double precision, several times over, and buffers of the writer.
     assert peak < 6e6

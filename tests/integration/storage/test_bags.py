@@ -1,7 +1,7 @@
 """Reading small bags of every kind."""
 
-import tracemalloc
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from l2m_gtsam.storage.bag_options import BagOptions, FixedTransform, Stamps, Tf
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.units import Unit
 from tests.drives.bags import KINDS, Entry, ros, write
+from tests.support.memory import with_peak
 
 START = 1_700_000_000_000_000_000
 STEP = 100_000_000
@@ -278,10 +279,7 @@ def test_memory_does_not_grow_with_images(tmp_path: Path) -> None:
     for kind in ("mcap", "sqlite3"):
         path = write(tmp_path, kind, sorted(found, key=lambda e: e.record_ns), kind)
         for work in (read_recording, inspect_bag):
-            tracemalloc.start()
-            work(path, BagOptions())
-            _, peak = tracemalloc.get_traced_memory()
-            tracemalloc.stop()
+            _, peak = with_peak(partial(work, path, BagOptions()))
             assert peak < 20e6
 
 

@@ -1,9 +1,9 @@
 """Bags that carry more than one thing where one is expected, or less than they promise."""
 
 import sqlite3
-import tracemalloc
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from l2m_gtsam.storage.bag import read_fields, read_recording, read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions, TfChain
 from l2m_gtsam.storage.inspect import inspect_bag
 from tests.drives.bags import KINDS, Entry, ros, write
+from tests.support.memory import with_peak
 
 START = 1_700_000_000_000_000_000
 STEP = 100_000_000
@@ -180,10 +181,7 @@ def test_memory_does_not_grow_with_point_clouds_in_ros1(tmp_path: Path) -> None:
     path = bag(tmp_path, "ros1", poses("ros1"), mag("ros1", "/m", "a"), each(cloud))
     assert path.stat().st_size > 60_000_000
     for work in (read_recording, inspect_bag):
-        tracemalloc.start()
-        work(path, BagOptions())
-        _, peak = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
+        _, peak = with_peak(partial(work, path, BagOptions()))
         assert peak < 20e6
 
 

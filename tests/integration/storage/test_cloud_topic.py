@@ -1,7 +1,6 @@
 """Clouds out of bags: scans of a moving, turning lidar become one cloud that stands still."""
 
 import re
-import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from l2m_gtsam.storage.cloud import thinned_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, TopicCloud, read_cloud_topic
 from tests.drives.bags import KINDS, Entry, ros, write
 from tests.drives.clouds import PLAIN, SECOND, START, Layout, entries, field, scan
+from tests.support.memory import with_peak
 
 FINE = CloudTopicOptions(edge=0.01)
 
@@ -124,12 +124,7 @@ def test_memory_follows_the_cells_and_not_the_scans(
     monkeypatch.setattr(cloud, "BATCH_POINTS", 20_000)
     all_points = len(stamps) * 20_000 * 3 * 8
     read(path)  # imports and caches
-    tracemalloc.start()
-    try:
-        read(path, CloudTopicOptions(edge=1.0))
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    _, peak = with_peak(lambda: read(path, CloudTopicOptions(edge=1.0)))
     assert peak < 0.4 * all_points
 
 

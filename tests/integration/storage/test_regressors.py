@@ -1,7 +1,6 @@
 """Numbers out of bags that go along with a drive."""
 
 import sqlite3
-import tracemalloc
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bag_options import RegressorTopic, Stamps
 from l2m_gtsam.storage.regressors import read_scalars
 from tests.drives.bags import KINDS, Entry, Ros, ros, write
+from tests.support.memory import with_peak
 
 START = 1_700_000_000_000_000_000
 STEP = 50_000_000
@@ -199,9 +199,7 @@ def test_memory_does_not_grow_with_what_is_not_asked_for(tmp_path: Path) -> None
     big = duties(make, [1.0] * 100_000)
     found = [Entry("/big", "std_msgs/Float64MultiArray", START + k, big) for k in range(30)]
     path = write(tmp_path, "mcap", found)
-    tracemalloc.start()
-    (first,) = read_scalars(path, {"first": RegressorTopic(topic="/big", field="data[0]")})
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
+    topics = {"first": RegressorTopic(topic="/big", field="data[0]")}
+    (first,), peak = with_peak(lambda: read_scalars(path, topics))
     assert len(first) == 30
     assert peak < 8e6

@@ -1,6 +1,5 @@
 """Scans out of bags one by one: points, their times as drivers write them, and what is wrong."""
 
-import tracemalloc
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, read_cloud_topic
 from l2m_gtsam.storage.point_cloud2 import ScanTopic, cloud_topic, has_clouds
 from tests.drives.bags import KINDS, Entry, ros, write
 from tests.drives.clouds import SECOND, START, TYPE, entries, field, scan
+from tests.support.memory import with_peak
 
 NEAR = ScanOptions(min_range=0.0, max_range=50.0)
 POINTS: FloatArray = np.random.default_rng(0).uniform(-5, 5, (40, 3))
@@ -180,10 +180,7 @@ def test_one_scan_is_in_memory_at_a_time(tmp_path: Path) -> None:
     given = (scan("mcap", START + k * SECOND, many) for k in range(30))
     path = write(tmp_path, "mcap", entries(given))
     next(iter(ScanTopic(path, None, NEAR)))  # what reading itself keeps
-    tracemalloc.start()
-    count = sum(1 for _ in ScanTopic(path, None, NEAR))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
+    count, peak = with_peak(lambda: sum(1 for _ in ScanTopic(path, None, NEAR)))
     assert count == 30
     # Message, columns, points, masks and the points of the scan before.
     assert peak < 20e6

@@ -1,6 +1,5 @@
 """Outliers and trends of a fleet: what is marked, and what never is."""
 
-import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +16,7 @@ from l2m_gtsam.qa.options import FleetOptions
 from l2m_gtsam.qa.report.figures.trends import trends, weighted_mean
 from l2m_gtsam.records.fleet import FleetRow
 from tests.drives.fleet_rows import row, sensor_row
+from tests.support.memory import with_peak
 
 OPTIONS = FleetOptions()
 SIGMA = 0.002  # metres
@@ -141,10 +141,7 @@ def test_the_middle_of_a_sample_is_nearly_that_of_all(seed: int) -> None:
 
 def test_thousands_of_rotations_take_little_memory() -> None:
     q = near(1, 20_000).as_quat()
-    tracemalloc.start()
-    rotations_apart(q)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
+    _, peak = with_peak(lambda: rotations_apart(q))
     assert peak < 50e6  # each with each would be 3 GB
 
 
