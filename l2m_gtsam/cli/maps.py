@@ -1,7 +1,7 @@
 """``l2m map``: maps of the magnetic field, and the suite of sensors that surveys them."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,9 @@ from l2m_gtsam.cli.terminal import (
     shown_progress,
     warn,
 )
+
+if TYPE_CHECKING:
+    from l2m_gtsam.batch.maps import MapDescription
 
 map_app = typer.Typer(
     help="Build, update, compare, describe and draw magnetic maps; calibrate a mapping suite.",
@@ -108,14 +111,13 @@ def map_build(
     with shown_progress() as progress:
         from l2m_gtsam.batch.files import make_tiles
         from l2m_gtsam.batch.maps import build_map_file
-        from l2m_gtsam.cli.tables.maps import map_table
         from l2m_gtsam.config import load_config, with_poses
 
         chosen = with_poses(load_config(config), bags, poses or (), times)
         built = build_map_file(bags, out, chosen, suite, progress, structure, lidar)
         if tiles:
             make_tiles(built.field_map, out, progress)
-    print_table(map_table(built.description))
+    _print_map(built.description)
     warn(built.description.summary.doubts)
     say(f"written: {out}")
 
@@ -146,7 +148,6 @@ def map_update(
     with shown_progress() as progress:
         from l2m_gtsam.batch.files import make_tiles
         from l2m_gtsam.batch.maps import keep_map_file_up, update_map_file
-        from l2m_gtsam.cli.tables.maps import changes_table, faded_lines, map_table
         from l2m_gtsam.config import load_config, with_poses
 
         chosen = with_poses(load_config(config), bags, poses or (), times)
@@ -154,12 +155,19 @@ def map_update(
         updated = update(map_path, bags, out, chosen, suite, progress)
         if tiles:
             make_tiles(updated.field_map, out, progress)
-    print_table(map_table(updated.description))
-    if (diary := updated.description.diary) is not None:
-        print_table(changes_table(diary))
-        say(*faded_lines(diary))
+    _print_map(updated.description)
     warn(updated.description.summary.doubts)
     say(f"written: {out}")
+
+
+def _print_map(description: "MapDescription") -> None:
+    """Print what a map is, and what changed since its survey."""
+    from l2m_gtsam.cli.tables.maps import changes_table, faded_lines, map_table
+
+    print_table(map_table(description))
+    if description.diary is not None:
+        print_table(changes_table(description.diary))
+        say(*faded_lines(description.diary))
 
 
 @map_app.command("compare")
@@ -189,13 +197,9 @@ def map_info(map_path: MapArgument) -> None:
     with shown_progress() as progress:
         from l2m_gtsam.batch.files import doubts_of_origin
         from l2m_gtsam.batch.maps import describe_map_file
-        from l2m_gtsam.cli.tables.maps import changes_table, faded_lines, map_table
 
         description = describe_map_file(map_path, progress)
-    print_table(map_table(description))
-    if (diary := description.diary) is not None:
-        print_table(changes_table(diary))
-        say(*faded_lines(diary))
+    _print_map(description)
     warn([*description.summary.doubts, *doubts_of_origin(description.provenance)])
 
 

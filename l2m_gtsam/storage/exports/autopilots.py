@@ -5,7 +5,7 @@ programs hold a symmetric matrix S beside an offset, so that nothing of M is los
 ``R (S (B_meas - offset))``, ArduPilot ``S (B_meas + offset)``; S is the inverse of M.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,6 +24,15 @@ REAL = 9  # MAVLink's number of a 32-bit floating-point parameter
 FLU_FRD = np.diag([1.0, -1.0, -1.0])
 # What a symmetric matrix leaves of M; the polar factor makes it zero but for rounding.
 SYMMETRIC = 1e-6
+RAW = "In the axes of the readings as they were recorded, which must be raw ones."
+PX4_SAYS = (
+    "PX4: field = ROT (S (reading - OFF)), gauss; S: SCALE on the diagonal, ODIAG beside.",
+    "CAL_MAGn_ID must be that of the sensor already.",
+    "Vehicle-Id Component-Id Name Value Type",
+)
+ARDUPILOT_SAYS = (
+    "ArduPilot: field = S (reading + OFS), milligauss; S: DIA on the diagonal, ODI beside.",
+)
 
 
 def correction(sensor: SensorCalibration) -> FloatArray:
@@ -93,7 +102,7 @@ def px4_text(export: Export) -> str:
         There are more sensors than PX4 has.
     """
     _refuse_many(export, PX4_SENSORS, "PX4")
-    lines = [*_head(export), *_px4_comments(export)]
+    lines = _comments(export, PX4_SAYS, [f"CAL_MAG{k}" for k in range(len(export.sensors))])
     for number, each in enumerate(export.sensors):
         for name, value in px4_parameters(each.calibration, number).items():
             lines.append("\t".join(("1", "1", name, _single(value), str(REAL))))
@@ -109,7 +118,8 @@ def ardupilot_text(export: Export) -> str:
         There are more sensors than ArduPilot has.
     """
     _refuse_many(export, ARDUPILOT_SENSORS, "ArduPilot")
-    lines = [*_head(export), *_ardupilot_comments(export)]
+    names = [f"compass {k + 1}" for k in range(len(export.sensors))]
+    lines = _comments(export, ARDUPILOT_SAYS, names)
     for number, each in enumerate(export.sensors):
         for name, value in ardupilot_parameters(each.calibration, number).items():
             lines.append(f"{name},{_single(value)}")
@@ -140,31 +150,16 @@ def _refuse_many(export: Export, most: int, program: str) -> None:
         )
 
 
-def _head(export: Export) -> Iterator[str]:
-    yield from (f"# {line}" for line in export.origin)
-    yield "# In the axes of the readings as they were recorded, which must be raw ones."
-
-
-def _px4_comments(export: Export) -> Iterator[str]:
-    yield "# PX4: field = ROT (S (reading - OFF)), gauss; S: SCALE on the diagonal, ODIAG beside."
-    yield "# CAL_MAGn_ID must be that of the sensor already."
-    yield "# Vehicle-Id Component-Id Name Value Type"
-    for number, each in enumerate(export.sensors):
+def _comments(export: Export, said: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Return what stands before parameters: their origin, what they are, how sensors are turned."""
+    lines = [*export.origin, RAW, *said]
+    for name, each in zip(names, export.sensors, strict=True):
         roll, pitch, yaw = _turn_deg(each.calibration)
-        yield (
-            f"# CAL_MAG{number} is {each.frame}: to the LiDAR's axes as forward, right, down it is "
-            f"turned by roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} deg"
+        lines.append(
+            f"{name} is {each.frame}: to the LiDAR's axes as forward, right, down it is turned by "
+            f"roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} deg"
         )
-
-
-def _ardupilot_comments(export: Export) -> Iterator[str]:
-    yield "# ArduPilot: field = S (reading + OFS), milligauss; S: DIA on the diagonal, ODI beside."
-    for number, each in enumerate(export.sensors):
-        roll, pitch, yaw = _turn_deg(each.calibration)
-        yield (
-            f"# compass {number + 1} is {each.frame}: to the LiDAR's axes as forward, right, down "
-            f"it is turned by roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} deg"
-        )
+    return [f"# {line}" for line in lines]
 
 
 def _turn_deg(sensor: SensorCalibration) -> FloatArray:
