@@ -9,11 +9,9 @@ from tests.worlds.exact import DipoleWorld
 STEP_NS = 50_000_000
 
 
-def recorded_drive(
-    world: DipoleWorld, sensors: tuple[KnownSensor, ...], seconds: float = 30.0
-) -> Recording:
-    """A smooth noiseless drive: figure of eight with pitching and rolling, poses at 20 Hz."""
-    s = np.arange(0, seconds, STEP_NS * 1e-9)
+def recorded_drive(world: DipoleWorld, sensors: tuple[KnownSensor, ...]) -> Recording:
+    """Half a minute on a figure of eight, pitching and rolling; poses without noise at 20 Hz."""
+    s = np.arange(0, 30.0, STEP_NS * 1e-9)
     angles = np.column_stack([0.5 * s, 0.2 * np.sin(1.1 * s), 0.2 * np.cos(1.7 * s)])
     R = Rotation.from_euler("ZYX", angles).as_matrix()
     p = np.column_stack([3 * np.sin(0.3 * s), 2 * np.sin(0.6 * s), 0.5 + 0.1 * np.sin(0.9 * s)])

@@ -123,9 +123,6 @@ def calibrated(
     return calibration(*entries)
 
 
-def small_hall(
-    seed: int, seconds: float, sensors: int = 2
-) -> tuple[tuple[KnownSensor, ...], SlamDrive]:
-    known = random_sensors(seed, sensors)
-    rng = np.random.default_rng(seed)
+def small_hall(seed: int, seconds: float) -> tuple[tuple[KnownSensor, ...], SlamDrive]:
+    known, rng = random_sensors(seed, 2), np.random.default_rng(seed)
     return known, slam_drive(dipole_world(1), known, rounds(seconds), rng)

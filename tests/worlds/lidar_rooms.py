@@ -111,9 +111,7 @@ def straight(count: int = 20, rate_hz: float = 10.0, speed: float = 1.0) -> Traj
 
 def rows(trajectory: Trajectory, numbers: Iterable[int]) -> Trajectory:
     """Return some of the poses of a trajectory."""
-    at = np.fromiter(numbers, dtype=np.int64)
-    ends = trajectory.frame, trajectory.child_frame
-    return Trajectory(trajectory.stamp_ns[at], trajectory.R[at], trajectory.p[at], *ends)
+    return trajectory[np.fromiter(numbers, dtype=np.int64)]
 
 
 def _slabs(box: Box, origin: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
