@@ -101,9 +101,7 @@ def changed_place() -> Drive:
 
 def short() -> Drive:
     """The vehicle stopped after a few metres."""
-    n = 60
-    start = Trajectory(EIGHT.stamp_ns[:n], EIGHT.R[:n], EIGHT.p[:n], "map", "lidar")
-    return drive(start)
+    return drive(EIGHT[np.arange(60)])
 
 
 def straight_line() -> Drive:

@@ -6,17 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2m_factors import G, X, assert_jacobians_match, scaled_step_factor
+from tests.support.factor_inputs import drawn_step
 
 NOISE = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]))
 
 
 def values_of(seed: int, longer: float) -> tuple[gtsam.Pose3, gtsam.Values]:
     """Return a step, and two key poses that are about so far apart."""
-    rng, values = np.random.default_rng(seed), gtsam.Values()
-    step = gtsam.Pose3.Expmap(rng.normal(0, [0.5] * 3 + [1.0] * 3))
-    first = gtsam.Pose3.Expmap(rng.normal(size=6))
-    values.insert(X(4), first)
-    values.insert(X(5), first.compose(step).retract(rng.normal(0, 0.2, 6)))
+    step, values = drawn_step(np.random.default_rng(seed))
     values.insert(G(), longer)
     return step, values
 

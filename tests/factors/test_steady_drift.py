@@ -15,17 +15,15 @@ from l2m_factors import (
     fixed_axes_step_factor,
 )
 from l2m_factors.field_map import FloatArray
+from tests.support.factor_inputs import drawn_step
 
 NOISE = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]))
 
 
 def drawn(seed: int) -> tuple[gtsam.Pose3, FloatArray, gtsam.Values]:
     """Return a step, weights of a drift, and two key poses that are about so far apart."""
-    rng, values = np.random.default_rng(seed), gtsam.Values()
-    step = gtsam.Pose3.Expmap(rng.normal(0, [0.5] * 3 + [1.0] * 3))
-    first = gtsam.Pose3.Expmap(rng.normal(size=6))
-    values.insert(X(4), first)
-    values.insert(X(5), first.compose(step).retract(rng.normal(0, 0.2, 6)))
+    rng = np.random.default_rng(seed)
+    step, values = drawn_step(rng)
     values.insert(V(), rng.normal(size=6))
     shape = (2, 3) if seed % 2 else (2,)  # along each axis, or the same along all
     return step, rng.uniform(0.0, 0.3, shape), values

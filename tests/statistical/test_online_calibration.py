@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
@@ -44,11 +44,6 @@ class Outcome:
     apart: FloatArray
 
 
-def thinned(truth: Trajectory) -> Trajectory:
-    rows = slice(None, None, RATE)
-    return Trajectory(truth.stamp_ns[rows], truth.R[rows], truth.p[rows], "map", "lidar")
-
-
 def nees_of(
     drawn: DrawnDrive,
     poses: list[gtsam.Pose3],
@@ -64,8 +59,9 @@ def nees_of(
 
 def one_drive(seed: int) -> Outcome:
     rng, world = np.random.default_rng(seed), dipole_world(seed)
-    sensors, truth = random_sensors(seed, SENSORS), thinned(rounds(SECONDS))
-    drawn = drawn_drive(world, sensors, truth, rng, FAR, every=EVERY)
+    sensors, truth = random_sensors(seed, SENSORS), rounds(SECONDS)
+    rows = np.arange(0, len(truth), RATE)
+    drawn = drawn_drive(world, sensors, truth[rows], rng, FAR, every=EVERY)
     beliefs = followed_beliefs(drawn.drive, world, RobustOptions(), free=True)
     last = beliefs[-1]
     on_line = nees_of(

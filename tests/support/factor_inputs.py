@@ -113,3 +113,12 @@ def step_error(seed: int, n: int, values: gtsam.Values) -> StepError:
     off = gtsam.Pose3.Expmap(rng.normal(0, 0.2, 6))
     way = values.atPose3(X(1)).between(values.atPose3(X(2)))
     return StepError(1, way.compose(off), rng.normal(0, 20, (n, 3, 6)))
+
+
+def drawn_step(rng: np.random.Generator) -> tuple[gtsam.Pose3, gtsam.Values]:
+    """Return a step, and key poses 4 and 5, which are about so far apart."""
+    step = gtsam.Pose3.Expmap(rng.normal(0, [0.5] * 3 + [1.0] * 3))
+    first, values = gtsam.Pose3.Expmap(rng.normal(size=6)), gtsam.Values()
+    values.insert(X(4), first)
+    values.insert(X(5), first.compose(step).retract(rng.normal(0, 0.2, 6)))
+    return step, values

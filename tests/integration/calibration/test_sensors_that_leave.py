@@ -70,7 +70,7 @@ def test_a_map_of_another_place_is_named_in_a_report() -> None:
 
 
 def test_a_short_drive_is_named_with_its_remedy_alone() -> None:
-    whole = drive(Trajectory(EIGHT.stamp_ns[:20], EIGHT.R[:20], EIGHT.p[:20], "map", "lidar"))
+    whole = drive(EIGHT[np.arange(20)])
     with pytest.raises(CalibrationError) as error:
         calibrate(whole.recording, whole.field_map, whole.options)
     told = str(error.value)

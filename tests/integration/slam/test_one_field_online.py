@@ -43,10 +43,8 @@ def all_of_it(shared_data: Path) -> TrueDrive:
 @pytest.fixture(scope="module")
 def ship(all_of_it: TrueDrive) -> TrueDrive:
     """The first 55 m, in which its poses pause twice."""
-    drive = all_of_it
-    rows, truth = slice(round(0.6 * len(drive.truth))), drive.truth
-    part = Trajectory(truth.stamp_ns[rows], truth.R[rows], truth.p[rows], "map", "lidar")
-    return replace(drive, truth=part, field=drive.field[rows])
+    drive, rows = all_of_it, np.arange(round(0.6 * len(all_of_it.truth)))
+    return replace(drive, truth=drive.truth[rows], field=drive.field[rows])
 
 
 def odometry_of(drive: TrueDrive, form: Form) -> tuple[Trajectory, SlamOptions]:

@@ -16,7 +16,7 @@ from l2m_gtsam.qa.metrics.trajectory import localised_trajectory
 from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.slam.map_prediction import poses_in
-from l2m_gtsam.slam.pose_graph import odometry_graph, shared_values
+from l2m_gtsam.slam.pose_graph import drive_values, odometry_graph
 from l2m_gtsam.slam.record import odometry_covariance, sensor_evidence
 from l2m_gtsam.storage.record_files import read_slam, write_slam
 from tests.drives.localised import WORLD, driven, localised, record
@@ -33,9 +33,7 @@ def test_odometry_with_shared_errors_is_as_sure_as_its_graph(
     assert steady is not None
     kept = None if vertical is None else steady * np.array([1.0, 1.0, vertical])
     drive = replace(drive, steps=replace(drive.steps, scale=scale, steady=kept))
-    values = shared_values(drive)
-    for k, pose in enumerate(drive.dead_reckoning()):
-        values.insert(X(k), pose)
+    values = drive_values(drive, drive.dead_reckoning())
     marginals = gtsam.Marginals(odometry_graph(drive), values)
     found = odometry_covariance(drive)
     for k in range(len(drive)):
@@ -45,9 +43,7 @@ def test_odometry_with_shared_errors_is_as_sure_as_its_graph(
 
 def test_odometry_is_as_sure_as_its_graph() -> None:
     drive = localised().solution.drive
-    values = shared_values(drive)
-    for k, pose in enumerate(drive.dead_reckoning()):
-        values.insert(X(k), pose)
+    values = drive_values(drive, drive.dead_reckoning())
     marginals = gtsam.Marginals(odometry_graph(drive), values)
     found, R = odometry_covariance(drive), localised().result.odometry.R
     for k, pose in enumerate(poses_in(values, len(drive))):

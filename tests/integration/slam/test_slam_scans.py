@@ -56,15 +56,25 @@ def drive_of(
     return known, slam_drive(dipole_world(1), known, truth, np.random.default_rng(seed))
 
 
-def fixes(room: Room, drive: SlamDrive, seed: int = 5) -> ScanEvidence:
-    """Return what scans say of a drive, on a cloud that was mapped at its true poses."""
-    rng, truth = np.random.default_rng(seed), drive.truth
-    mapping, seen = rows(truth, range(0, len(truth), 100)), rows(truth, range(1, len(truth), EVERY))
+def scanned(truth: Trajectory) -> Trajectory:
+    """Return the poses of a drive's scans."""
+    return rows(truth, range(1, len(truth), EVERY))
+
+
+def mapped(room: Room, truth: Trajectory, rng: np.random.Generator) -> Surface:
+    """Return the cloud of a room from a few of a drive's true poses."""
+    mapping = rows(truth, range(0, len(truth), 100))
     points = [
         scan.points @ mapping.R[k].T + mapping.p[k]
         for k, scan in enumerate(scans(room, mapping, rng))
     ]
-    cloud = Surface(smoothed(thinned_cloud(np.concatenate(points), 0.1)))
+    return Surface(smoothed(thinned_cloud(np.concatenate(points), 0.1)))
+
+
+def fixes(room: Room, drive: SlamDrive, seed: int = 5) -> ScanEvidence:
+    """Return what scans say of a drive, on a cloud that was mapped at its true poses."""
+    rng, seen = np.random.default_rng(seed), scanned(drive.truth)
+    cloud = mapped(room, drive.truth, rng)
     steps = scan_odometry(scans(room, seen, rng), mended(drive), 0.25, OPTIONS)
     options = ScanLocalisationOptions(registration=REGISTRATION)
     start = PoseEstimate(RigidTransform(seen.R[0], seen.p[0]), 1e-2 * np.eye(6))
@@ -141,7 +151,7 @@ def test_loops_of_scans_help_where_nothing_is_mapped() -> None:
     """Two laps of 21 m; a third of each is seen again."""
     known, drive = drive_of(23, laps(75), sensors=2)
     rng, truth = np.random.default_rng(6), drive.truth
-    seen = rows(truth, range(1, len(truth), EVERY))
+    seen = scanned(truth)
     steps = scan_odometry(scans(ROOM, seen, rng), mended(drive), 0.25, OPTIONS)
     loops = ScanEvidence(loops=find_loop_closures(steps, LoopOptions()).loops)
     assert len(loops) > 10
@@ -160,7 +170,7 @@ def test_loops_of_scans_help_where_nothing_is_mapped() -> None:
 def test_a_corridor_closes_no_loop() -> None:
     """One part of it looks like another: what determines no place is not believed."""
     _, drive = drive_of(24, rounds(40))
-    seen = rows(drive.truth, range(1, len(drive.truth), EVERY))
+    seen = scanned(drive.truth)
     found = scans(CORRIDOR, replace(seen, p=seen.p * [1.0, 0.3, 1.0]), np.random.default_rng(7))
     steps = scan_odometry(found, mended(drive), 0.25, OPTIONS)
     assert find_loop_closures(steps, LoopOptions()).loops == ()
@@ -172,12 +182,7 @@ def test_scans_are_fixes_on_line_and_one_that_lies_is_left_out(
     """Every fourth scan is seen 1.2 m to the side, as by a wrong transform: none of them counts."""
     known, drive = hall
     rng, truth = np.random.default_rng(5), drive.truth
-    mapping, seen = rows(truth, range(0, len(truth), 100)), rows(truth, range(1, len(truth), EVERY))
-    points = [
-        scan.points @ mapping.R[k].T + mapping.p[k]
-        for k, scan in enumerate(scans(ROOM, mapping, rng))
-    ]
-    cloud = Surface(smoothed(thinned_cloud(np.concatenate(points), 0.1)))
+    cloud, seen = mapped(ROOM, truth, rng), scanned(truth)
     matcher = ScanMatcher(cloud, ScanLocalisationOptions(), 0.25, OPTIONS.drift)
     lying = [
         replace(each, points=each.points + np.array([0.0, 1.2, 0.0])) if k % 4 == 3 else each
@@ -215,7 +220,7 @@ def revisiting() -> LoopsOnLine:
     """
     known, drive = drive_of(24, laps(80), sensors=2)
     rng, truth = np.random.default_rng(6), drive.truth
-    seen = rows(truth, range(1, len(truth), EVERY))
+    seen = scanned(truth)
     aside = np.array([0.0, 1.5, 0.0])
     lying = [
         replace(each, points=each.points + aside) if k % 4 == 3 and k > 60 else each

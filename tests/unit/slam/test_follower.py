@@ -19,7 +19,7 @@ from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.slam.online.measurements import CELL_M, CachedVariance
 from l2m_gtsam.slam.options import CalibrationUse, DriftOptions, SlamOptions
-from l2m_gtsam.slam.pose_graph import calibration_values, odometry_graph
+from l2m_gtsam.slam.pose_graph import calibration_values, odometry_graph, pose_values
 from l2m_gtsam.slam.smoother import SmoothingProblem
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
@@ -65,8 +65,8 @@ class HalfMap:
 
 
 def thinned(seconds: float) -> Trajectory:
-    truth, rows = rounds(seconds), slice(None, None, 2)
-    return Trajectory(truth.stamp_ns[rows], truth.R[rows], truth.p[rows], "map", "lidar")
+    truth = rounds(seconds)
+    return truth[np.arange(0, len(truth), 2)]
 
 
 def drawn(seconds: float) -> DrawnDrive:
@@ -90,8 +90,7 @@ def solved_at_once(drive: Drive) -> Belief:
     """Return what the whole graph says of the last key pose and the sensors."""
     problem = SmoothingProblem(drive, WORLD, SlamOptions(calibration=CalibrationUse.REFINED))
     values, all_of_them = calibration_values(drive.sensors), np.ones(len(drive.readings))
-    for k, pose in enumerate(drive.dead_reckoning()):
-        values.insert(X(k), pose)
+    values.insert(pose_values(drive.dead_reckoning()))
     for _ in range(2):  # readings hang on their ways as these came out the first time
         seen = problem.predict(values)
         graph = problem.graph(seen, all_of_them, seen.prediction.map_variance, None)
@@ -189,9 +188,7 @@ def test_a_belief_is_carried_as_gtsam_carries_it() -> None:
     pose = gtsam.Pose3(gtsam.Rot3(start.T_map_lidar.R), start.T_map_lidar.t)
     behind = Belief(pose, drive.sensors, start.covariance)
     ahead = behind.predicted(step, covariance).marginalize_previous()
-    graph, values = odometry_graph(drive), gtsam.Values()
-    for k, each in enumerate(drive.dead_reckoning()):
-        values.insert(X(k), each)
+    graph, values = odometry_graph(drive), pose_values(drive.dead_reckoning())
     expected = gtsam.Marginals(graph, values).marginalCovariance(X(1))
     np.testing.assert_allclose(ahead.covariance, expected, rtol=1e-6, atol=1e-12)
 

@@ -14,7 +14,7 @@ from l2m_gtsam.maps.potential import PotentialHyperparameters
 from l2m_gtsam.slam.drive import EXACT_START, Drive
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.pose_graph import odometry_graph, shared_values
+from l2m_gtsam.slam.pose_graph import drive_values, odometry_graph
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.path_density import PathDensity
 from l2m_gtsam.slam.unknown_field.path_information import path_information, path_readings
@@ -66,15 +66,18 @@ def step(request: pytest.FixtureRequest) -> Step:
         start=replace(drive.start, covariance=EXACT_START),
         sensors=drive.sensors.loosened(0.1, 2.0) if loose else drive.sensors,
     )
-    poses, values = drive.dead_reckoning(), shared_values(drive)
+    poses = drive.dead_reckoning()
     poses[1] = poses[1].retract(rng.normal(0, 0.02, 6))
-    for k, pose in enumerate(poses):
-        values.insert(X(k), pose)
     prior = PotentialHyperparameters(sigma=3.0, length=0.6)
     spectrum = FieldSpectrum(
         prior, NOISE, np.append(np.eye(3).ravel(), np.zeros(3)), 0.0, np.zeros(5)
     )
-    return Step(drive, poses, values, WholePrior(spectrum, np.full(3, -1.0), np.full(3, 1.8), 120))
+    return Step(
+        drive,
+        poses,
+        drive_values(drive, poses),
+        WholePrior(spectrum, np.full(3, -1.0), np.full(3, 1.8), 120),
+    )
 
 
 def dense(step: Step) -> FloatArray:

@@ -8,10 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import KeyPoseReadings, KeyPoseResiduals, Whitening, X, key_pose_residuals
+from l2m_factors import KeyPoseReadings, KeyPoseResiduals, Whitening, key_pose_residuals
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.slam.odometry import odometry_steps
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
+from l2m_gtsam.slam.pose_graph import pose_values
 from l2m_gtsam.slam.relative_motion import bridge_whitening, shifted_readings
 from l2m_gtsam.slam.smoother import SmoothingProblem, localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
@@ -169,10 +170,7 @@ def test_what_a_way_contributes_is_what_whitening_knows() -> None:
     """Of one reading the share in its covariance, of all the slow sum over pairs of them."""
     given_drive = drive(4).drive
     problem = SmoothingProblem(given_drive, WORLD, SlamOptions())
-    values = gtsam.Values()
-    for k, pose in enumerate(given_drive.dead_reckoning()):
-        values.insert(X(k), pose)
-    seen = problem.predict(values)
+    seen = problem.predict(pose_values(given_drive.dead_reckoning()))
     motions, by_lidar = seen.motions, seen.prediction.by_lidar
     rows = np.flatnonzero(motions.readings.key_pose == 2)
     n, Q, s = len(rows), motions.covariance[2], motions.readings.fraction[rows]
