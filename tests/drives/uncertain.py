@@ -98,3 +98,14 @@ def all_features(errors: ErrorModes, points: FloatArray) -> FloatArray:
         A[rows, :, start : start + size] = errors.features(points[rows], tile)
         start += size
     return A
+
+
+def own_noise(
+    field_map: HarmonicMap, points: FloatArray, A: FloatArray, CR: FloatArray
+) -> FloatArray:
+    """Return the covariance of each reading's own errors, its noise and the map's, (N, 3, 3).
+
+    ``A`` has what of the map's error the modes explain, ``CR`` turns fields into readings.
+    """
+    rest = np.maximum(field_map.variance(points) - np.einsum("nir,nir->ni", A, A), 0.0)
+    return np.asarray(NOISE**2 * np.eye(3) + np.einsum("nij,nj,nkj->nik", CR, rest, CR))

@@ -25,6 +25,7 @@ from tests.drives.uncertain import (
     WORLD,
     all_features,
     dense_rows,
+    own_noise,
     turning_poses,
 )
 from tests.worlds.exact import DipoleWorld
@@ -67,10 +68,8 @@ def dense_solution(readings: Readings, field_map: HarmonicMap, near: Estimate) -
     x += readings.p_map_lidar
     errors = field_map.errors_over(x)
     A = all_features(errors, x)
-    rest = np.maximum(field_map.variance(x) - np.einsum("nir,nir->ni", A, A), 0.0)
     CR = near.C()[readings.sensor] @ readings.R_map_lidar.transpose(0, 2, 1)
-    noise = NOISE**2 * np.eye(3) + np.einsum("nij,nj,nkj->nik", CR, rest, CR)
-    whiten = np.linalg.inv(np.linalg.cholesky(noise))
+    whiten = np.linalg.inv(np.linalg.cholesky(own_noise(field_map, x, A, CR)))
     ideal = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
     ridges = [np.sqrt(near.ridge[s]) * np.eye(15)[3:12] for s in range(len(SENSORS))]
     prior = block_diag(*ridges, np.linalg.inv(np.linalg.cholesky(errors.covariance)))

@@ -20,6 +20,7 @@ from tests.drives.uncertain import (
     STARTS,
     all_features,
     dense_rows,
+    own_noise,
 )
 
 LASTS_S = 0.7
@@ -60,9 +61,8 @@ def noise_covariance(readings: Readings, field_map: HarmonicMap, estimate: Estim
     x = np.einsum("nij,j->ni", readings.R_map_lidar, estimate.t[0]) + readings.p_map_lidar
     errors, R_lidar_map = field_map.errors_over(x), readings.R_map_lidar.transpose(0, 2, 1)
     A = all_features(errors, x)
-    rest = np.maximum(field_map.variance(x) - np.einsum("nir,nir->ni", A, A), 0.0)
     CR = C @ R_lidar_map
-    own = NOISE**2 * np.eye(3) + np.einsum("nij,nj,nkj->nik", CR, rest, CR)
+    own = own_noise(field_map, x, A, CR)
     by_map = (CR @ A).reshape(3 * N, -1)
     seconds = 1e-9 * readings.stamp_ns
     like = np.exp(-np.abs(seconds[:, None] - seconds) / LASTS_S)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from l2m_factors import skew
 from l2m_gtsam.calibration.pose_errors import pose_seconds
@@ -16,7 +17,15 @@ from l2m_gtsam.validation.innovation import (
     marginalise_calibration,
 )
 from tests.drives.calibrations import SIGMA
-from tests.drives.uncertain import NOISE, WORLD, small_sensors, surveyed, turning_poses
+from tests.drives.uncertain import (
+    NOISE,
+    WORLD,
+    all_features,
+    own_noise,
+    small_sensors,
+    surveyed,
+    turning_poses,
+)
 
 SENSOR = small_sensors(1)[0]
 COUNT = 60
@@ -68,17 +77,9 @@ def dense(
     C, x = vector[3:12].reshape(3, 3), R @ vector[:3] + readings.p_map_lidar
     CR = C @ R.transpose(0, 2, 1)
     told = field_map.errors_over(x)
-    owner, ends = told.owner(x), np.cumsum([0, *told.sizes().values()])
-    A = np.zeros((len(x), 3, ends[-1]))
-    for k, tile in enumerate(told.sizes()):
-        rows = owner == tile
-        A[rows, :, ends[k] : ends[k + 1]] = told.features(x[rows], tile)
-    rest = np.maximum(field_map.variance(x) - np.einsum("nir,nir->ni", A, A), 0.0)
+    A = all_features(told, x)
     shared = (CR @ A).reshape(3 * len(x), -1)
-    S = NOISE**2 * np.eye(3 * len(x)) + shared @ told.covariance @ shared.T
-    for n in range(len(x)):
-        at = slice(3 * n, 3 * n + 3)
-        S[at, at] += CR[n] @ np.diag(rest[n]) @ CR[n].T
+    S = block_diag(*own_noise(field_map, x, A, CR)) + shared @ told.covariance @ shared.T
     assert readings.regressors is not None
     q = np.kron(readings.regressors, np.eye(3))
     S += q @ np.diag(calibration.number_sigma[0] ** 2) @ q.T
