@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
+from l2m_gtsam.data import RigidTransform, Trajectory
 from l2m_gtsam.geometry import compose
 from tests.drives.slam import SlamDrive
-from tests.worlds.exact import DipoleWorld
 
 
 @dataclass(frozen=True)
@@ -36,13 +35,6 @@ def jumped(trajectory: Trajectory, *shifts: Shift) -> Trajectory:
         R[k:] = carry.R @ R[k:]
         p[k:] = p[k:] @ carry.R.T + carry.t
     return replace(trajectory, R=R, p=p)
-
-
-def with_steel(world: DipoleWorld, at: FloatArray, moment: FloatArray) -> DipoleWorld:
-    """Return a place in which another dipole stands, metres and A m^2, shape (3,)."""
-    return DipoleWorld(
-        world.uniform, np.vstack([world.positions, at]), np.vstack([world.moments, moment])
-    )
 
 
 def opened(before: SlamDrive, after: SlamDrive, row: int) -> SlamDrive:

@@ -49,6 +49,4 @@ def with_pallet(hall: DipoleWorld, angle: float, moment: FloatArray) -> DipoleWo
     middle = np.array([5.3 * np.cos(angle), 3.8 * np.sin(angle), 0.4])
     pieces = middle + np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     moments = np.tile(moment / len(pieces), (len(pieces), 1))
-    return DipoleWorld(
-        hall.uniform, np.vstack([hall.positions, pieces]), np.vstack([hall.moments, moments])
-    )
+    return hall.with_dipoles(pieces, moments)

@@ -16,7 +16,7 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from tests.drives.degenerate import POSTS, STRONG, World, eight, mounted, straight
-from tests.worlds.exact import DipoleWorld, dipole_world
+from tests.worlds.exact import dipole_world
 
 NOISE = 0.1
 PLACES = np.array([[0.2, -0.1, 0.15], [-0.3, 0.25, 0.1], [0.1, 0.3, -0.1]])
@@ -90,13 +90,8 @@ def dead_axis() -> Drive:
 
 def changed_place() -> Drive:
     """Steel was put beside the way after the survey."""
-    steel = np.array([[2.0, 1.5, 0.0]]), np.array([[15.0, 10.0, 20.0]])
-    place = DipoleWorld(
-        STRONG.uniform,
-        np.vstack([STRONG.positions, steel[0]]),
-        np.vstack([STRONG.moments, steel[1]]),
-    )
-    return drive(place=place)
+    steel = STRONG.with_dipoles(np.array([2.0, 1.5, 0.0]), np.array([15.0, 10.0, 20.0]))
+    return drive(place=steel)
 
 
 def short() -> Drive:

@@ -1,6 +1,6 @@
 """Fields with closed forms and random drives through them, for tests that need an exact map."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -50,6 +50,14 @@ class DipoleWorld:
     uniform: FloatArray
     positions: FloatArray
     moments: FloatArray
+
+    def with_dipoles(self, positions: FloatArray, moments: FloatArray) -> "DipoleWorld":
+        """Return a world with more dipoles, metres and A m^2, shapes (N, 3) or (3,)."""
+        return replace(
+            self,
+            positions=np.vstack([self.positions, positions]),
+            moments=np.vstack([self.moments, moments]),
+        )
 
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""

@@ -83,12 +83,7 @@ def route(low: float, high: float) -> FloatArray:
 
 def with_steel(position: FloatArray, moment: FloatArray) -> DipoleWorld:
     """Return the yard with steel that was brought: metres and A m^2, shapes (3,)."""
-    yard = world()
-    return DipoleWorld(
-        yard.uniform,
-        np.vstack([yard.positions, position]),
-        np.vstack([yard.moments, moment]),
-    )
+    return world().with_dipoles(position, moment)
 
 
 def survey(

@@ -229,11 +229,7 @@ def test_a_sensor_that_is_in_one_drive_only_is_calibrated_from_it() -> None:
 
 def test_a_changed_place_is_told_with_the_drive_and_its_own_time() -> None:
     """Steel beside the way of the second drive only."""
-    steel = DipoleWorld(
-        STRONG.uniform,
-        np.vstack([STRONG.positions, [[2.0, 1.5, 0.0]]]),
-        np.vstack([STRONG.moments, [[15.0, 10.0, 20.0]]]),
-    )
+    steel = STRONG.with_dipoles(np.array([2.0, 1.5, 0.0]), np.array([15.0, 10.0, 20.0]))
     found = made(monday(), recorded("tuesday", way(0.4, DAY_NS), 2, place=steel))
     stretches = found.calibrated.result.disagreements
     assert stretches

@@ -16,7 +16,7 @@ from l2m_gtsam.records.scans import PoseFix, ScanEvidence
 from l2m_gtsam.slam.localisation import Localisation, localise
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.record import RecordContext, localisation_record
-from tests.drives.faults import jumped, opened, shift, with_steel
+from tests.drives.faults import jumped, opened, shift
 from tests.drives.slam import COARSE, WIDE, SlamDrive, calibrated, rounds, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
@@ -258,7 +258,7 @@ def test_a_door_that_opens_is_reported_and_does_not_pull(three: tuple[KnownSenso
     truth, known = rounds(40), calibrated(three)
     beside = truth.p[600] + truth.R[600] @ np.array([0.0, 0.8, -0.2])
     drive = slam_drive(WORLD, three, truth, np.random.default_rng(21))
-    other = with_steel(WORLD, beside, np.array([0.0, 0.0, 60.0]))
+    other = WORLD.with_dipoles(beside, np.array([0.0, 0.0, 60.0]))
     changed = opened(drive, slam_drive(other, three, truth, np.random.default_rng(21)), 400)
     done = found(changed, known)
     assert done.result.status is LocalisationStatus.LOCALISED

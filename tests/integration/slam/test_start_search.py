@@ -84,11 +84,7 @@ def test_two_rooms_alike_are_both_reported() -> None:
     """The second room is the first once more, 30 m away."""
     room = strange_hall(3)
     apart = np.array([30.0, 0.0, 0.0])
-    both = DipoleWorld(
-        room.uniform,
-        np.concatenate([room.positions, room.positions + apart]),
-        np.concatenate([room.moments, room.moments]),
-    )
+    both = room.with_dipoles(room.positions + apart, room.moments)
     sensors, drive = lost_drive(both, 3)
     field_map = surveyed(both, 0.0, 30.0)
     found = searched((sensors, drive), field_map, longest_m=8.0)

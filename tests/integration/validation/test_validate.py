@@ -237,11 +237,8 @@ def test_no_steel_is_made_up_where_the_map_is_of_elsewhere() -> None:
 
 def test_a_changed_place_does_not_pull() -> None:
     """Steel beside the way spoils a tenth of the readings: named, and no change of the sensors."""
-    place = DipoleWorld(
-        STRONG.uniform,
-        np.vstack([STRONG.positions, loops().p[150] + [0.5, 0.3, -0.3]]),
-        np.vstack([STRONG.moments, [15.0, 10.0, 20.0]]),
-    )
+    beside = loops().p[150] + [0.5, 0.3, -0.3]
+    place = STRONG.with_dipoles(beside, np.array([15.0, 10.0, 20.0]))
     found = on_drive(other_drive(place=place))
     verdict = judged(found)
     for sensor in found.sensors:

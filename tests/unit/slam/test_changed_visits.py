@@ -48,12 +48,6 @@ TURN, SHIFT = np.array([0.01, -0.01, 0.04]), np.array([0.1, -0.1, 0.02])
 WAY = Way(gtsam.Pose3(), np.diag(MOTION**2), np.zeros(2))
 
 
-def with_steel(world: DipoleWorld) -> DipoleWorld:
-    return DipoleWorld(
-        world.uniform, np.vstack([world.positions, AT]), np.vstack([world.moments, MOMENT])
-    )
-
-
 def seen(world: DipoleWorld, points: FloatArray, rng: np.random.Generator, first: int) -> Seen:
     field = world.field_and_gradient(points)[0]
     noise = rng.normal(0, NOISE, field.shape)
@@ -70,7 +64,9 @@ def visits(seed: int, share: float, off: float = 1.0) -> list[Visit]:
     ways = np.concatenate([line(rng), line(rng)])
     earlier, way = seen(world, ways, rng, 0), line(rng)
     clean = seen(world, way, rng, 100)
-    brought = with_steel(world).field_and_gradient(way)[0] - world.field_and_gradient(way)[0]
+    brought = (
+        world.with_dipoles(AT, MOMENT).field_and_gradient(way)[0] - world.field_and_gradient(way)[0]
+    )
     come = np.arange(len(way)) >= share * len(way)
     R = Rotation.from_rotvec(off * TURN).as_matrix()
     field = (clean.field + brought * come[:, None]) @ R.T
