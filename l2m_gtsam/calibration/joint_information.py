@@ -27,7 +27,7 @@ from scipy.linalg.lapack import dpotri
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.solve.linear_algebra import add_upper, submatrix, upper_product
+from l2m_gtsam.solve.linear_algebra import add_upper, submatrix
 
 SHARED = -1  # of rows that are no one sensor's
 NO_READINGS = np.empty(0, dtype=np.int64)
@@ -154,14 +154,13 @@ class HalfCovariance:
         """
         scaled = J * self.scale[at]
         half = scaled @ submatrix(self.half, at)
-        parts = scaled.reshape(-1, size, len(at)), half.reshape(-1, size, len(at))
-        found = parts[1] @ parts[0].transpose(0, 2, 1)
+        shape = (-1, size, len(at))
+        found = half.reshape(shape) @ scaled.reshape(shape).transpose(0, 2, 1)
         return np.asarray(found + found.transpose(0, 2, 1))
 
     def trace(self, at: IntArray, J: FloatArray) -> float:
         """Return the trace of ``J Sigma J^T`` for J by some variables, shape (m, k)."""
-        scaled = J * self.scale[at]
-        return 2 * float(upper_product(self.half, at, scaled.T @ scaled))
+        return float(self.blocks(at, J, 1).sum())
 
 
 def leverage(every: HalfCovariance, rows: Rows, whitening: FloatArray) -> FloatArray:

@@ -230,12 +230,8 @@ class UncertainOptimum:
     def _left(self) -> FloatArray:
         """Share of the variance of each reading's residual that the fit leaves, shape (N,)."""
         left = np.ones(len(self._residual))
-        for rows, white in zip(
-            [each for each in self.joint.rows if len(each.readings)],
-            self.problem.noise.whitenings,
-            strict=True,
-        ):
-            left[rows.readings] = 1 - leverage(self.joint.every, rows, white)
+        for each in self._groups:
+            left[each.rows.readings] = 1 - leverage(self.joint.every, each.rows, each.whitening)
         return left
 
     @cached_property

@@ -11,6 +11,7 @@ A drift is taken out of the stamps. A map of stamps that drift is bent along the
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -26,7 +27,7 @@ from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
 # are left out err alike for longer than neighbouring readings show.
 LEAST_SIGMAS = 6.0
 # Without any one window. A field that waves of one window do not follow looks like a drift there:
-# in one of thirty halls with exact clocks by 9 of them, and by none without that window.
+# in one of forty halls with exact clocks by 9 of them, and by none without that window.
 LEAST_ELSEWHERE = 3.0
 FASTEST = 0.01  # of a rate, prior: a clock that is off by more than a hundredth is none
 
@@ -94,12 +95,11 @@ def clock_drifts(
     prior[:known, :known] = prior_information(len(sensors), options)
     prior[np.arange(known, count), np.arange(known, count)] = FASTEST**-2
     step, sigmas = scored(seen, alike, prior)
-    rates = step[known:]
-    elsewhere = np.abs(rates) / sigmas[known:]
-    for left_out in range(len(seen) if len(seen) > 1 else 0):
-        without, spread = scored(seen[:left_out] + seen[left_out + 1 :], alike, prior)
-        elsewhere = np.minimum(elsewhere, np.sign(rates) * without[known:] / spread[known:])
-    return ClockDrifts(rates, sigmas[known:], elsewhere)
+    # A survey of one window is judged by that.
+    fewer = combinations(seen, len(seen) - 1) if len(seen) > 1 else [seen]
+    without = [np.divide(*scored(each, alike, prior)) for each in fewer]
+    elsewhere = (np.sign(step) * without).min(axis=0)
+    return ClockDrifts(step[known:], sigmas[known:], elsewhere[known:])
 
 
 @dataclass(frozen=True)

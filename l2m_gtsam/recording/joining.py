@@ -15,6 +15,7 @@ import numpy as np
 from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,
+    IntArray,
     LidarMotion,
     Readings,
     Recording,
@@ -92,7 +93,7 @@ def joined_readings(parts: Sequence[Synchronised], recording: Recording) -> Sync
             replace(
                 each,
                 sensors=names,
-                sensor=np.array([names.index(name) for name in each.sensors])[each.sensor],
+                sensor=_numbers(each, names)[each.sensor],
                 stamp_ns=each.stamp_ns + by,
                 motion=_motion(each) if moving else None,
                 pose_root=_pose_root(each) if uncertain else None,
@@ -233,6 +234,10 @@ def _source(drives: Sequence[Recording]) -> SourceFile:
     digests = "\0".join(each.source.sha256 for each in drives)
     paths = ", ".join(each.source.path for each in drives)
     return SourceFile(paths, hashlib.sha256(digests.encode()).hexdigest())
+
+
+def _numbers(readings: Readings, names: Sequence[str]) -> IntArray:
+    return np.array([names.index(name) for name in readings.sensors], dtype=np.int64)
 
 
 def _motion(readings: Readings) -> LidarMotion:

@@ -168,22 +168,6 @@ def add_upper(matrix: FloatArray, at: IntArray, block: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def upper_product(matrix: FloatArray, at: IntArray, block: FloatArray) -> float:
-    """Return the sum over the upper triangle of a matrix of its elements times those of a block.
-
-    Parameters are those of ``add_upper``.
-    """
-    total = 0.0
-    for i in range(len(at)):
-        row = at[i]
-        for j in range(len(at)):
-            column = at[j]
-            if column >= row:
-                total += matrix[row, column] * block[i, j]
-    return total
-
-
-@njit(cache=True, nogil=True)
 def submatrix(matrix: FloatArray, at: IntArray) -> FloatArray:
     """Return the rows and columns ``at`` of a matrix, in their order, shape (k, k)."""
     found = np.empty((len(at), len(at)))

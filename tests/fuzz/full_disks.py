@@ -19,9 +19,9 @@ from tests.fuzz.trials import (
     break_all,
     hidden,
     next_run,
+    print_and_exit,
     start,
     state,
-    told,
 )
 
 PAGE = 4096  # that a small file takes
@@ -92,7 +92,7 @@ def _taken(folder: Path) -> int:
 def main() -> None:
     """Fill as the command line asks."""
     chosen, asked = asked_for("disks", 20, __doc__)
-    told(break_all(filled, chosen, asked.times, asked.out, asked.seed))
+    print_and_exit(break_all(filled, chosen, asked.times, asked.out, asked.seed))
 
 
 if __name__ == "__main__":

@@ -20,9 +20,9 @@ from tests.fuzz.trials import (
     break_all,
     hidden,
     next_run,
+    print_and_exit,
     start,
     state,
-    told,
 )
 
 LOOK_AGAIN_S = 0.0005
@@ -64,7 +64,7 @@ def _await(number: int, is_time: Callable[[], bool], most_s: float) -> None:
 def main() -> None:
     """Kill as the command line asks."""
     chosen, asked = asked_for("kills", 200, __doc__)
-    told(break_all(killed, chosen, asked.times, asked.out, asked.seed))
+    print_and_exit(break_all(killed, chosen, asked.times, asked.out, asked.seed))
 
 
 if __name__ == "__main__":

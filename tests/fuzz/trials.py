@@ -308,7 +308,7 @@ def break_all(
     return found
 
 
-def told(found: Counter[tuple[str, str]]) -> NoReturn:
+def print_and_exit(found: Counter[tuple[str, str]]) -> NoReturn:
     """Print what was found, and end; with exit code 1 if any of it is bad."""
     print(table(found))
     sys.exit(int(any(left in BAD for _, left in found)))

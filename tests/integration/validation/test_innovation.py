@@ -76,10 +76,10 @@ def dense(
     vector, R = calibration.vector, readings.R_map_lidar
     C, x = vector[3:12].reshape(3, 3), R @ vector[:3] + readings.p_map_lidar
     CR = C @ R.transpose(0, 2, 1)
-    told = field_map.errors_over(x)
-    A = all_features(told, x)
+    modes = field_map.errors_over(x)
+    A = all_features(modes, x)
     shared = (CR @ A).reshape(3 * len(x), -1)
-    S = block_diag(*own_noise(field_map, x, A, CR)) + shared @ told.covariance @ shared.T
+    S = block_diag(*own_noise(field_map, x, A, CR)) + shared @ modes.covariance @ shared.T
     assert readings.regressors is not None
     q = np.kron(readings.regressors, np.eye(3))
     S += q @ np.diag(calibration.number_sigma[0] ** 2) @ q.T
