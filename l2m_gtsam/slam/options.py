@@ -99,9 +99,12 @@ class WholeFieldOptions(Options):
     """And of the entries of C: soft iron beside a sensor that was calibrated elsewhere, or not at
     all, comes to that. A drive that turns determines most of them, so that a larger value
     costs little."""
+    online_distortion: float = Field(default=0.03, gt=0)
+    """The same on line, where the drive so far is short: beside errors of the poses and an unknown
+    field it does not determine as much, and poses follow what is wrong."""
     solve_after_m: float = Field(default=10.0, gt=0)
     """On line, path length after which the drive is solved for the first time, and again whenever
-    its path has doubled."""
+    it has grown by two fifths."""
 
 
 class CalibrationUse(StrEnum):

@@ -1,7 +1,7 @@
 """On-line SLAM of one sensor in an unknown field: one field for all of the drive so far.
 
-A filter follows the drive key pose by key pose. Each time that the path has doubled, or has grown
-by a quarter and left the box of the field, the drive so far is solved as off line, from its
+A filter follows the drive key pose by key pose. Each time that the path has grown by two fifths, or
+by a quarter and has left the box of the field, the drive so far is solved as off line, from its
 odometry on (:mod:`.smoothed_drive`), and the filter goes on from what that says of the last key
 pose, field and sensor (``end_state``). The work is spread over the key poses that come
 meanwhile, which are then followed. To begin the solution at the poses found so far was tried: it
@@ -44,11 +44,10 @@ from l2m_gtsam.slam.unknown_field.whole_field import (
 from l2m_gtsam.solve.chi_square import exceeded_by
 
 # Of the filter's noise. Slow errors count as white there: of errors that last 3 to 4 s, with a
-# reading each 0.43 s, white ones 3.7 to 4.5 times as large say as much. On the model ship 2, 3, 4
-# and 5 give errors of 0.48, 0.47, 0.47 and 0.49 m in the mean of twelve drives that the filter
-# follows from their start, and a NEES of 13.1, 8.6, 7.3 and 5.7.
-NOISE_FACTOR = 4.0
-GROWN = 2.0  # path, after which the drive is solved again: all of it takes twice the last solution
+# reading each 0.43 s, white ones 3.7 to 4.5 times as large say as much. On the model ship 3 and 4
+# give the same errors, and a NEES of 4.5 and 3.7.
+NOISE_FACTOR = 3.0
+GROWN = 1.4  # path, after which the drive is solved again: all takes 3.5 times the last solution
 LEFT = 1.25  # the same where the vehicle has left the box, or a correction was refused
 NEAR = 1.0  # lengths of the field, to the faces of the box: nearer, these matter
 IMPOSSIBLE = float(exceeded_by(1e-6, POSE))  # squared distance from odometry in its sigmas
@@ -122,7 +121,7 @@ class OneFieldExplorer:
     """
 
     def __init__(self, start: StartPose, sensors: KnownSensors, options: SlamOptions) -> None:
-        self.start, self._sensors, self._options = start, sensors, options
+        self.start, self._sensors, self._options = start, sensors, of_short_drives(options)
         self._origin = as_pose(start.T_map_lidar)
         self._key_poses: list[ArrivedKeyPose] = []
         self._path_m, self._learnt_m = 0.0, 0.0
@@ -363,6 +362,13 @@ class OneFieldExplorer:
             self._open.remove(each.number)
             self._decisions[each.number] = each
             self._news.append(each)
+
+
+def of_short_drives(options: SlamOptions) -> SlamOptions:
+    """Return options with what a drive so far may show of C in place of what a whole one may."""
+    whole = options.whole_field
+    short = whole.model_copy(update={"distortion": whole.online_distortion})
+    return options.model_copy(update={"whole_field": short})
 
 
 def _is_inside(now: FollowedField) -> bool:

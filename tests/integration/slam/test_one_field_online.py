@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field import one_field_explorer
+from l2m_gtsam.slam.unknown_field.odometry_hypotheses import Hypotheses
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 from l2m_gtsam.slam.unknown_field.smoothed_drive import smoothed
 from l2m_gtsam.studies.slam.methods import as_recorded, online_row, rms, stated_drift
@@ -65,14 +67,15 @@ def whole(ship: TrueDrive) -> tuple[OnlineSlam, list[OnlinePose]]:
 def test_most_of_a_ships_drift_goes_as_it_drives(all_of_it: TrueDrive) -> None:
     """Each pose when it is made, along fixed axes; docs/studies/slam has all drives.
 
-    It is 61 % here, 70 % in the mean of seeds 3 to 9 (docs/slam-measurements.md).
+    It is 75 % here. With seeds 0 to 9 of both runs 26 to 44 cm are left of 1.3 to 1.9 m, with NEES
+    of 2.7 to 9.7 (docs/slam-measurements.md).
     """
     odometry, options = odometry_of(all_of_it, Form.WORLD)
     row = online_row(all_of_it, odometry, options, STATED_UT)
-    assert row.rms_m < 0.5 * rms(odometry.p, all_of_it.truth.p)
+    assert row.rms_m < 0.4 * rms(odometry.p, all_of_it.truth.p)
     # Poses of one drive err together, and the filter linearises each reading once.
     assert row.nees is not None
-    assert row.nees < 24
+    assert row.nees < 12
 
 
 def test_it_is_one_field_and_jumps_of_the_recording_are_motion(
@@ -91,11 +94,11 @@ def test_it_is_one_field_and_jumps_of_the_recording_are_motion(
     truth = ship.truth.p[np.searchsorted(ship.truth.stamp_ns, stamps)]
     odometry, _ = odometry_of(ship, Form.VEHICLE)
     drift = odometry.p[np.searchsorted(odometry.stamp_ns, stamps)]
-    # 36 % with this seed; in all of the drive up to 41 % with seeds 0 to 9.
-    assert rms(np.stack([each.T_map_lidar.t for each in poses]), truth) < 0.5 * rms(drift, truth)
+    # 48 % with this seed, 43 to 65 % with seeds 0 to 9: the field is learnt after a quarter of it.
+    assert rms(np.stack([each.T_map_lidar.t for each in poses]), truth) < 0.7 * rms(drift, truth)
 
 
-# Of the messages. The field is learnt after 18 % of the path, and again after 36 %.
+# Of the messages. The field is learnt after 22 % of them.
 @pytest.mark.parametrize(
     ("share", "until", "learnt"),
     [(0.12, 0.25, False), (0.3, 0.4, True)],
@@ -184,23 +187,24 @@ def test_a_drive_too_long_to_be_solved_goes_on_with_the_filter(
 
 
 def test_a_pose_that_odometry_excludes_is_refused(ship: TrueDrive) -> None:
-    """As if odometry were a hundred times better known at one key pose.
+    """As if readings had led the filter astray, by ten sigmas of odometry, at one key pose.
 
-    In the first 40 % of the drive, where the field was learnt after 18 %.
+    In the first 40 % of the drive, where the field was learnt after 22 %.
     """
     odometry, options = odometry_of(ship, Form.VEHICLE)
     slam = OnlineSlam(as_recorded(STATED_UT), options)
-    refused, given = None, list(messages(ship.recording(odometry)))
+    is_astray, given = False, list(messages(ship.recording(odometry)))
     for each in given[: round(0.4 * len(given))]:
         found = give(slam, each)
         explorer = slam.estimator
-        if not found or not isinstance(explorer, OneFieldExplorer) or not explorer.is_learnt:
+        if not found or not isinstance(explorer, OneFieldExplorer) or explorer._now is None:
             continue
-        if refused is None:
-            known = explorer._reckoned
-            by_drift = known.by_drift / 1e2
-            explorer._reckoned = replace(known, walk=known.walk / 1e4, by_drift=by_drift)
-        refused = found if refused is None else refused
+        if not is_astray:
+            best = explorer._now.hypotheses.best
+            away = gtsam.Pose3(gtsam.Rot3(), np.array([5.0, 0.0, 0.0]))
+            state = replace(best.state, pose=best.state.pose.compose(away))
+            astray = Hypotheses((replace(best, state=state),))
+            explorer._now, is_astray = replace(explorer._now, hypotheses=astray), True
     kinds = [each.kind for each in slam.events()]
     assert kinds.count(EventKind.CORRECTION_REFUSED) == 1
     # Learnt again at odometry's poses, a quarter of the path later.
