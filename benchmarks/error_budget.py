@@ -3,7 +3,7 @@
 Processor seconds, one BLAS thread. *Without*: the rounds of the graph until its weights settle, and
 its covariances. *With*: the same, then the search for processes, the rounds with those that were
 found, the checks on parts and halves of the drive and on stated sizes, and variances by cause. The
-solve begins 5 cm beside the sensors, after the global start.
+solve begins 5 cm beside the sensors; a calibration looks for starts before it.
 """
 
 from dataclasses import dataclass, replace
@@ -16,6 +16,7 @@ from benchmarks.one_key import NOISE, hall, survey
 from l2m_gtsam.calibration.alternation import Alternated, OneKeyOptions, start_estimate
 from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.one_key import settle, solve_one_key
+from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
 from l2m_gtsam.calibration.uncertain import settle_by_any, solve_uncertain
 from l2m_gtsam.calibration.uncertain_graph import UncertainDrive
 from l2m_gtsam.calibration.view import RememberedMap, StandIns
@@ -32,12 +33,36 @@ WALK_UT, POSE_M, POSE_S = 0.3, 0.007, 2.0
 
 @dataclass(frozen=True)
 class Cost:
-    """Processor seconds of the last graph and of the solve, and the processes that were found."""
+    """Processor seconds, and the processes that were found.
+
+    Attributes
+    ----------
+    without, whole
+        Of the last graph without the error budget and with it.
+    solve, starts
+        Of the solve with it, and of the search for starts.
+    kinds
+        What was found.
+    """
 
     without: float
     whole: float
     solve: float
+    starts: float
     kinds: tuple[str, ...]
+
+    @property
+    def beside(self) -> float:
+        """What the error budget adds."""
+        return self.whole - self.without
+
+    def columns(self) -> tuple[str, ...]:
+        """Return without, with and ratio: of the last graph, the solve, and that with starts."""
+        wholes = (self.whole, self.solve, self.starts + self.solve)
+        return tuple(
+            f"{whole - self.beside:7.2f} {whole:6.2f} {whole / (whole - self.beside):6.2f}"
+            for whole in wholes
+        )
 
 
 def nothing(readings: Readings) -> Readings:
@@ -91,8 +116,10 @@ def cost(field_map: CompiledMap, readings: Readings) -> Cost:
     kinds = sorted({each.process.kind.value for each in whole.budget.found})
     ended = process_time()
     solve_one_key(readings, RememberedMap(field_map), start.t + BESIDE_M, OPTIONS)
-    solve = process_time() - ended
-    return Cost(between - began, ended - between, solve, tuple(kinds))
+    solved = process_time()
+    find_starts(readings, field_map, np.zeros(3), StartOptions())
+    starts = process_time() - solved
+    return Cost(between - began, ended - between, solved - ended, starts, tuple(kinds))
 
 
 @one_blas_thread()
@@ -101,16 +128,12 @@ def main() -> None:
     data = survey(hall(1), 8000)
     field_map = HarmonicMap.fit(data.points, data.field).compile()
     clean = laps(random_sensors(1, SENSORS), hall(1), EACH)
-    print(f"{SENSORS} x {EACH}   last graph without, with (s), ratio   solve without, with, ratio")
+    print(f"{SENSORS} x {EACH}: seconds without, with, ratio")
+    print(f"{'':>10} {'last graph':>21}   {'solve':>21}   {'starts and solve':>21}   found")
     for change in (nothing, wandering, misplaced):
         found = cost(field_map, change(clean))
-        without = found.solve - found.whole + found.without
-        print(
-            f"{change.__name__:>10} {found.without:18.2f} {found.whole:9.2f} "
-            f"{found.whole / found.without:6.2f} {without:17.2f} {found.solve:6.2f} "
-            f"{found.solve / without:6.2f}   {', '.join(found.kinds) or 'nothing'}",
-            flush=True,
-        )
+        kinds = ", ".join(found.kinds) or "nothing"
+        print(f"{change.__name__:>10} {'   '.join(found.columns())}   {kinds}", flush=True)
 
 
 if __name__ == "__main__":
