@@ -44,8 +44,8 @@ from l2m_gtsam.slam.unknown_field.whole_field import (
 from l2m_gtsam.solve.chi_square import exceeded_by
 
 # Of the filter's noise. Slow errors count as white there: of errors that last 3 to 4 s, with a
-# reading each 0.43 s, white ones 3.7 to 4.5 times as large say as much. On the model ship 3 and 4
-# give the same errors, and a NEES of 4.5 and 3.7.
+# reading each 0.43 s, white ones 3.7 to 4.5 times as large say as much. On the model ship 3,
+# after a last stage with 1.5, and 4, after one with 2, leave the same errors; NEES is 4.5 and 3.7.
 NOISE_FACTOR = 3.0
 GROWN = 1.4  # path, after which the drive is solved again: all takes 3.5 times the last solution
 LEFT = 1.25  # the same where the vehicle has left the box, or a correction was refused
@@ -121,7 +121,7 @@ class OneFieldExplorer:
     """
 
     def __init__(self, start: StartPose, sensors: KnownSensors, options: SlamOptions) -> None:
-        self.start, self._sensors, self._options = start, sensors, of_short_drives(options)
+        self.start, self._sensors, self._options = start, sensors, _of_short_drives(options)
         self._origin = as_pose(start.T_map_lidar)
         self._key_poses: list[ArrivedKeyPose] = []
         self._path_m, self._learnt_m = 0.0, 0.0
@@ -364,7 +364,7 @@ class OneFieldExplorer:
             self._news.append(each)
 
 
-def of_short_drives(options: SlamOptions) -> SlamOptions:
+def _of_short_drives(options: SlamOptions) -> SlamOptions:
     """Return options with what a drive so far may show of C in place of what a whole one may."""
     whole = options.whole_field
     short = whole.model_copy(update={"distortion": whole.online_distortion})
