@@ -36,6 +36,8 @@ ORDER = (
 """Of use."""
 USER, FAULT, SIGNAL = 2, 70, 128  # exit codes: 70 is that of sysexits.h for internal errors
 LOST = "standard output: cannot be written: "
+# Click's UsageError; newer releases of Typer have Click inside, where it has no public name.
+UsageError: Any = typer.BadParameter.__mro__[1]
 # Files of results name themselves when they cannot be written.
 UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -106,6 +108,8 @@ def _told(error: BaseException) -> tuple[str, int]:
         return f"stopped by {name}; {done}", SIGNAL + error.number
     if isinstance(error, L2MError):
         return str(error), USER
+    if isinstance(error, UsageError):
+        return _misused(error), USER
     if isinstance(error, BrokenPipeError):
         return "standard output: closed before all was printed", USER
     if isinstance(error, MemoryError):
@@ -116,6 +120,13 @@ def _told(error: BaseException) -> tuple[str, int]:
         return f"{where}{what}{error.strerror or error}", USER
     what = f"{type(error).__name__}: {error}"
     return f"a fault of this program, please report it with what --debug shows: {what}", FAULT
+
+
+def _misused(error: Any) -> str:
+    """Return what is wrong with a command line, and where it says what is right."""
+    what = str(error.format_message()).rstrip(".")
+    command = error.ctx.command_path if error.ctx else "l2m"
+    return f"{what[:1].lower()}{what[1:]} (`{command} --help` shows all options)"
 
 
 def _forget_output() -> None:
@@ -207,9 +218,14 @@ def _suit_large_arrays() -> None:
 def _run(arguments: list[str]) -> None:
     """Run a command; what it printed has arrived when it returns or ends."""
     try:
-        app(arguments)
+        ended = app(arguments, prog_name="l2m", standalone_mode=False)
+    except UsageError as error:
+        if str(error.format_message()):
+            raise
+        ended = USER  # a group without a command has shown its help
     finally:
         flush_output()
+    sys.exit(ended)
 
 
 def _version(wanted: bool) -> None:

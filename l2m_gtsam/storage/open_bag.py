@@ -219,6 +219,8 @@ def _check_files(path: Path) -> None:
         raise BagError(f"{path}: no such file; accepted: {ACCEPTED}")
     if not path.is_dir():
         require_regular(path, BagError)
+        if not is_bag(path):
+            raise BagError(f"{path}: not a bag, by its name; accepted: {ACCEPTED}")
         return
     try:
         inside = [each for each in path.iterdir() if not each.is_dir()]

@@ -193,6 +193,32 @@ def test_a_process_ends_with_one_line(tmp_path: Path) -> None:
     assert "nowhere.bag: no such file" in one_line(run)
 
 
+@pytest.mark.parametrize(
+    ("command", "complaint"),
+    [
+        (["slam", "a.mcap"], "missing option '--calibration' (`l2m slam --help` shows"),
+        (["calibrate", "--mapp"], "no such option: --mapp"),
+        (["map", "bild"], "no such command 'bild'. Did you mean 'build'? (`l2m map --help`"),
+        (["simulate", "--out", "s", "--seed", "a"], "invalid value for '--seed'"),
+    ],
+)
+def test_a_wrong_command_line_is_told_in_one_line(command: list[str], complaint: str) -> None:
+    assert complaint in complaint_here(*command)
+
+
+@pytest.mark.parametrize("group", [[], ["map"]])
+def test_a_group_without_a_command_shows_its_help(group: list[str]) -> None:
+    run = ended(*group)
+    assert (run.code, run.err) == (2, "")
+    assert "Commands" in run.out
+
+
+def test_options_in_the_place_of_a_bag(tmp_path: Path) -> None:
+    (tmp_path / "options.yaml").write_text("seed: 1")
+    line = complaint_here("map", "build", tmp_path / "options.yaml", "--out", tmp_path / "m.npz")
+    assert "options.yaml: not a bag, by its name; accepted: a ROS1 .bag" in line
+
+
 def test_debug_leaves_an_error_to_python(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="no such file"):
         ended("inspect", tmp_path / "nowhere.bag", "--debug")

@@ -17,7 +17,7 @@ RUN = [sys.executable, "-c", "from l2m_gtsam.cli.app import main; main()"]
 
 
 def test_a_fault_of_the_program_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(_: list[str]) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("\x1b[31mred\nand more")
 
     monkeypatch.setattr(app, "app", broken)
@@ -30,7 +30,7 @@ def test_a_fault_of_the_program_is_one_line(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_debug_shows_where(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(_: list[str]) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("why")
 
     monkeypatch.setattr(app, "app", broken)
@@ -50,7 +50,7 @@ def test_debug_shows_where(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_the_system_refuses(
     monkeypatch: pytest.MonkeyPatch, error: Exception, told: str
 ) -> None:
-    def broken(_: list[str]) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr(app, "app", broken)

@@ -6,7 +6,7 @@ from pathlib import Path
 from l2m_gtsam.cli import app
 from l2m_gtsam.storage.files import atomic_path
 
-def slow(arguments):
+def slow(arguments, **_):
     ready = Path(arguments[0])
     with atomic_path(ready.with_name("result")) as temporary:
         temporary.write_text("half")
