@@ -163,7 +163,7 @@ def draw_windows(
         rows = rng.permutation(members[tile])[: learning.readings]
         return window_of(readings[np.sort(rows)], sources, tiling, tile, resolution)
 
-    spread = spread_tiles(tiling, [len(rows) for rows in members], learning.windows)
+    spread = spread_tiles(tiling, members, learning.windows)
     rough = rough_tiles(readings, members, learning.rough, spread)
     return Windows([window(tile) for tile in spread], [window(tile) for tile in rough])
 
