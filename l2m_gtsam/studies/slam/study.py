@@ -27,6 +27,7 @@ from l2m_gtsam.studies.slam.recordings import (
     robot_run,
     ship_run,
 )
+from l2m_gtsam.studies.statistics import mean_of
 from l2m_gtsam.studies.study import Study
 
 Cell = TypeVar("Cell")
@@ -265,12 +266,6 @@ def figures_of(rows: list[MethodRow], before: list[MethodRow]) -> MethodFigures:
         peak_mib=max((each.peak_mib for each in rows if each.peak_mib is not None), default=None),
         unchanged=sum(each.unchanged for each in rows),
     )
-
-
-def mean_of(values: list[float | None]) -> float | None:
-    """Return the mean of what is stated; None of nothing."""
-    stated = [each for each in values if each is not None]
-    return float(np.mean(stated)) if stated else None
 
 
 SLAM = SlamStudy()
