@@ -33,9 +33,6 @@ class BasinStudy(Study[BasinOptions, DistortionCells, BasinTable]):
     name = "basin"
     title = "How far off may a guess be?"
     size = frozenset({"distortions"})
-    options = BasinOptions
-    cell = DistortionCells
-    summary = BasinTable
 
     def keys(self, options: BasinOptions) -> tuple[str, ...]:
         """Return one cell for each distortion."""

@@ -82,9 +82,6 @@ class ChangesStudy(Study[ChangesStudyOptions, ChangesCell, ChangesSummary]):
     name = "changes"
     title = "Places that change"
     size = frozenset({"halls", "unchanged"})
-    options = ChangesStudyOptions
-    cell = ChangesCell
-    summary = ChangesSummary
 
     def keys(self, options: ChangesStudyOptions) -> tuple[str, ...]:
         """Return the paths, hall by hall, then further ones without changes."""

@@ -52,9 +52,6 @@ class HonestyStudy(Study[HonestyOptions, HonestyCell, HonestySummary]):
     name = "honesty"
     title = "Are the stated errors true?"
     size = frozenset({"surveys", "noises", "troubled_noises"})
-    options = HonestyOptions
-    cell = HonestyCell
-    summary = HonestySummary
 
     def keys(self, options: HonestyOptions) -> tuple[str, ...]:
         """Return a cell for each noise, survey and condition, those of one survey together."""

@@ -122,9 +122,6 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
     name = "slam"
     title = "SLAM in an unknown field"
     size = frozenset({"seeds", "recordings"})
-    options = SlamStudyOptions
-    cell = SlamCell
-    summary = SlamSummary
 
     def keys(self, options: SlamStudyOptions) -> tuple[str, ...]:
         """Return one cell for each recording, drift, form and seed."""

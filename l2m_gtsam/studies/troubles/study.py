@@ -91,9 +91,6 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
     name = "troubles"
     title = "What a PASS is worth"
     size = frozenset({"surveys", "worlds"})
-    options = TroublesOptions
-    cell = TroublesCell
-    summary = TroublesSummary
 
     def keys(self, options: TroublesOptions) -> tuple[str, ...]:
         """Return a cell for each survey and condition, those of one map together."""
