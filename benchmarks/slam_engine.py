@@ -76,12 +76,11 @@ def readings(pose: int, tile: int, J: FloatArray) -> gtsam.CustomFactor:
 def open_section(tiles: int, weights: int) -> list[str]:
     """Descend and take a covariance, by GTSAM and by the dense Newton steps of the tests."""
     given = section(tiles, weights, 36)
-    priors, last = list(prior_factors(given.known)), X(tiles + 35)
+    priors, last = prior_factors(given.known), X(tiles + 35)
 
     def by_gtsam() -> None:
         whole = gtsam.NonlinearFactorGraph(given.graph)
-        for factor in priors:
-            whole.add(factor)
+        whole.push_back(priors)
         found = levenberg_marquardt(whole, given.start, colamd_ordering(whole), STEPS, 0.0)
         joint_posterior(whole.linearize(found.values), [last])
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.data import BoolArray, FloatArray, RigidTransform
 from l2m_gtsam.errors import CalibrationError
 
 
@@ -207,20 +207,24 @@ def polar_rotation(C: FloatArray, covariance: FloatArray) -> PolarRotation:
             skew[axis, 3 * row + j] += R[row, i]
             skew[axis, 3 * row + i] -= R[row, j]
     J = R @ np.linalg.solve(np.trace(P) * np.eye(3) - P, skew)
-    return PolarRotation(R, _propagated(J, covariance))
+    return PolarRotation(R, propagated(J, covariance))
 
 
-def _propagated(J: FloatArray, covariance: FloatArray) -> FloatArray:
+def propagated(J: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return ``J covariance J^T``; what rests on an infinite variance is infinite itself."""
-    unknown = np.isinf(np.diag(covariance))
+    unknown = ~np.isfinite(np.diag(covariance))
+    # The delta method; 0 * inf is no number, so that infinite variances are propagated apart.
     finite = np.where(unknown[:, None] | unknown, 0.0, covariance)
-    result = J @ finite @ J.T
     # 1e-9 separates a part that is zero but for rounding from one that is not.
-    open_ = np.abs(J[:, unknown]).max(axis=1, initial=0.0) > 1e-9
-    result[open_, :] = 0.0
-    result[:, open_] = 0.0
-    result[open_, open_] = np.inf
-    return np.asarray(result)
+    rests_on_them = np.abs(J[:, unknown]).max(axis=1, initial=0.0) > 1e-9
+    return undetermined(J @ finite @ J.T, rests_on_them)
+
+
+def undetermined(covariance: FloatArray, which: BoolArray) -> FloatArray:
+    """Return a covariance, (n, n), with infinite variance of some and no correlation, (n,)."""
+    left = np.where(which[:, None] | which, 0.0, covariance)
+    left[which, which] = np.inf
+    return left
 
 
 def dead_axis(C: FloatArray) -> str | None:

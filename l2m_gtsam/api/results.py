@@ -105,7 +105,7 @@ class JudgedCalibration(Shown):
             ),
             "time_offset_s": 0.0 if offset is None else offset.seconds,
             "noise_ut": sensor.noise,
-            "readings": 0 if sensor.residuals is None else sensor.residuals.readings,
+            "readings": sensor.used,
         }
 
     def to_dict(self) -> dict[str, Any]:

@@ -94,8 +94,15 @@ def stated_at(
     """
     problem = joint_problem(view, field_map, estimate, options)
     if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
-        tests = problem.determinacies
-        solved = _uncertain(view, field_map, field_map, estimate, tests, options)
+        # With the map's error, of which nothing is known yet, in the graph.
+        drive = UncertainDrive.of(view, field_map, field_map, estimate, options)
+        values = starting_values(estimate, view.sensors, drive.prior.coverage)
+        shared = UncertainProblem(drive, estimate, problem.determinacies, options.factors)
+        optimum = UncertainOptimum.at(shared, values)
+        solved = optimum.solutions()
+        if options.warp_m > 0:
+            unseen = foretold_warp(optimum.informed_of_warp(), options.warp_m)
+            solved = optimum.with_unseen(solved, unseen)
         return Forecast(view, solved, Uncertainty.FULL)
     return Forecast(view, sensor_solutions(problem, estimate), Uncertainty.INDEPENDENT)
 
@@ -150,24 +157,3 @@ def ideal_sensors(start: Estimate, view: View, options: OneKeyOptions) -> Ideal:
     field = np.einsum("nij,nj->ni", start.C()[view.readings.sensor], view.b_lidar)
     view = replace(view, readings=replace(view.readings, field=field))
     return Ideal(replace(start, ridge=fit_distortions(view, start, options).ridge), view)
-
-
-def _uncertain(
-    view: View,
-    field_map: QueryableMap,
-    errors: UncertainMap,
-    estimate: Estimate,
-    tests: dict[int, Determinacy],
-    options: OneKeyOptions,
-) -> tuple[SensorSolution, ...]:
-    """Return the solutions with the map's error, of which nothing is known yet, in the graph."""
-    drive = UncertainDrive.of(view, field_map, errors, estimate, options)
-    values = starting_values(estimate, view.sensors, drive.prior.coverage)
-    problem = UncertainProblem(drive, estimate, tests, options.factors)
-    optimum = UncertainOptimum.at(problem, values)
-    solved = optimum.solutions()
-    if options.warp_m > 0:
-        return optimum.with_unseen(
-            solved, foretold_warp(optimum.informed_of_warp(), options.warp_m)
-        )
-    return solved

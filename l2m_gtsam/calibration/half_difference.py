@@ -23,6 +23,7 @@ from scipy.linalg import solve_triangular
 
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
+from l2m_gtsam.geometry import undetermined
 
 JUDGED = 15  # t, C row by row, H: a clock is that of the whole drive
 # Of the information that the readings had if all else were known: what has less is left open by a
@@ -178,8 +179,6 @@ def solved(
     sound = values > OPEN
     inverse = (axes[:, sound] / values[sound]) @ axes[:, sound].T / np.outer(scale, scale)
     root = inverse @ by_loose.T
-    covariance = inverse + root @ root.T
     touched = np.square(axes[:, ~sound]).sum(axis=1) > TOUCHED
-    covariance[touched], covariance[:, touched] = 0.0, 0.0
-    covariance[touched, touched] = np.inf
+    covariance = undetermined(inverse + root @ root.T, touched)
     return np.where(touched, 0.0, inverse @ pull), covariance

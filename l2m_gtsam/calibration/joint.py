@@ -36,6 +36,7 @@ from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.calibration.variance_parts import Parts, by_block
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.geometry import undetermined
 from l2m_gtsam.records.calibration import ResidualFigures
 from l2m_gtsam.records.error_budget import EXPLAINED, ErrorCause, Unmodelled
 from l2m_gtsam.solve.noise import (
@@ -341,8 +342,4 @@ def with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:
 
     A parameter that such a direction touches has infinite variance and no correlation.
     """
-    determined, touched = covariance.copy(), np.append(test.touched, not test.offset)
-    determined[touched, :] = 0.0
-    determined[:, touched] = 0.0
-    determined[touched, touched] = np.inf
-    return determined
+    return undetermined(covariance, np.append(test.touched, not test.offset))

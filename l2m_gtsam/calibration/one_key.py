@@ -15,7 +15,6 @@ too; the readings' poses are taken anew as it moves.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
@@ -227,19 +226,10 @@ def solve_by_parts(
     return found.by_parts
 
 
-class SharedFinish(Protocol):
-    """The finish over a map that knows its errors."""
-
-    def __call__(
-        self,
-        view: View,
-        field_map: QueryableMap,
-        errors: UncertainMap,
-        near: Estimate,
-        tests: Mapping[int, Determinacy],
-        options: OneKeyOptions,
-    ) -> UncertainSolution:
-        """Return the solutions from the optimum with independent errors."""
+SharedFinish = Callable[
+    [View, QueryableMap, UncertainMap, Estimate, Mapping[int, Determinacy], OneKeyOptions],
+    UncertainSolution,
+]
 
 
 @dataclass(frozen=True)

@@ -166,11 +166,10 @@ def _assess(drive: SolvedDrive, options: CalibrationOptions) -> tuple[SensorCali
 def _with_rejected(sensor: SensorCalibration, rejected: int) -> SensorCalibration:
     """Return the same with the number of its readings that nothing explains, and what follows."""
     sensor = replace(sensor, rejected=rejected)
-    used = 0 if sensor.residuals is None else sensor.residuals.readings
-    if rejected <= MOST_REJECTED * (used + rejected):
+    if rejected <= MOST_REJECTED * sensor.inside:
         return sensor
     msg = (
-        f"{rejected} of {used + rejected} readings inside the map fit no distortion that explains "
+        f"{rejected} of {sensor.inside} readings inside the map fit no distortion that explains "
         "the others: is it the right map, and are the poses in its frame?"
     )
     if sensor.status not in (SensorStatus.SOLVED, SensorStatus.OUTSIDE_MAP):

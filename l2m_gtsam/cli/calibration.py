@@ -47,10 +47,8 @@ def inspect(
         chosen = with_poses(load_config(config), [bag], poses or (), times)
         report = inspect_file(bag, chosen, progress)
     print_table(bag_table(report), wide)
-    for note in report.notes:
-        say(note)
-    for obstacle in report.obstacles:
-        say(f"cannot be calibrated as it is: {obstacle}")
+    say(*report.notes)
+    say(*(f"cannot be calibrated as it is: {each}" for each in report.obstacles))
     say("clock: record time less header stamp, median; |B|: lowest - median - highest")
     if report.obstacles:
         raise typer.Exit(1)
@@ -217,8 +215,7 @@ def _print_calibration(result: "CalibrationResult", models: bool, wide: bool) ->
 
     print_table(calibration_table(result), wide)
     say(*status_lines(result))
-    for note in result.notes:
-        say(note)
+    say(*result.notes)
     say(UNCERTAINTY[result.uncertainty])
     warn(result.doubts)
     warn(missing_note(result))
@@ -227,8 +224,7 @@ def _print_calibration(result: "CalibrationResult", models: bool, wide: bool) ->
         say(held)
     for table in model_tables(result) if models else ():
         print_table(table, wide)
-    for note in filter(None, map(model_note, result.sensors)):
-        say(note)
+    say(*filter(None, map(model_note, result.sensors)))
 
 
 def batch(

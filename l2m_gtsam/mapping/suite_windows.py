@@ -135,7 +135,7 @@ def _dealt(
 ) -> list[tuple[int, IntArray]]:
     """Return tiles spread over a survey, with readings of which none belongs to two of them."""
     members = tiling.grid.members(points, tiling.overlap)
-    tiles = spread_tiles(tiling, [len(rows) for rows in members], options.windows)
+    tiles = spread_tiles(tiling, members, options.windows)
     away = np.abs(points[:, None, :2] - tiling.grid.centres[tiles]).max(axis=2)
     nearest = np.argmin(away, axis=1)
     dealt = []

@@ -30,6 +30,7 @@ from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.training import TrainingSet, training_set
 from l2m_gtsam.options import Options
+from l2m_gtsam.solve.noise import rms
 
 COMPARED = tuple(kind for kind in KINDS if kind != "dense_gp")  # that one only checks another
 LARGEST_FOLD, LEAST_FOLD, SMALLER = 1.5, 0.1, 0.8  # metres, and the step between
@@ -383,11 +384,11 @@ def figures_of(prediction: Prediction, shared: BoolArray) -> KindFigures:
         log_likelihood=float(prediction.log_likelihood.mean()),
         inside=float(inside.mean()),
         rmse_axes=np.sqrt(np.mean(error**2, axis=0)),
-        rmse=float(np.sqrt(np.mean(error**2))),
-        rmse_shared=float(np.sqrt(np.mean(both**2))) if len(both) else np.nan,
-        z_std=float(np.sqrt(np.mean(z**2))),
+        rmse=rms(error),
+        rmse_shared=rms(both) if len(both) else np.nan,
+        z_std=rms(z),
         coverage=float(np.mean(np.abs(z) <= Z_95)),
-        noise=float(np.sqrt(np.mean(prediction.noise**2))),
+        noise=rms(prediction.noise),
         seconds=float(prediction.seconds.mean()),
     )
 

@@ -68,9 +68,7 @@ def _length_sigma(H: FloatArray, covariance: FloatArray) -> float:
 
 
 def _rejected(sensor: SensorCalibration) -> float:
-    used = 0 if sensor.residuals is None else sensor.residuals.readings
-    inside = used + sensor.rejected
-    return sensor.rejected / inside if inside else NAN
+    return sensor.rejected / sensor.inside if sensor.inside else NAN
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from l2m_gtsam.calibration.calibrate import Calibrated
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Recording, Trajectory
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.qa.evaluate import evidence_of
 from l2m_gtsam.qa.metrics.assemble import solved_sensors
-from l2m_gtsam.qa.metrics.evidence import DriveEvidence, Queryable, sensor_evidence
+from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import curves
 from l2m_gtsam.qa.metrics.plain import evenly
 from l2m_gtsam.records.calibration import SensorCalibration
@@ -41,7 +42,7 @@ def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:
     return Scene(recording.source.sha256, seen, drive_views(drives), sensors)
 
 
-def map_view(field_map: Queryable, places: FloatArray) -> MapView:
+def map_view(field_map: QueryableMap, places: FloatArray) -> MapView:
     """Return a map on a level lattice through the middle of places, shape (N, 3), around them."""
     low, high = places[:, :2].min(axis=0) - AROUND, places[:, :2].max(axis=0) + AROUND
     cell = float(np.sqrt(np.prod(high - low) / LATTICE))
@@ -64,7 +65,7 @@ def drive_views(drives: Sequence[Trajectory]) -> tuple[DriveView, ...]:
     return tuple(views)
 
 
-def _sensor(sensor: SensorCalibration, drive: DriveEvidence, field_map: Queryable) -> SensorView:
+def _sensor(sensor: SensorCalibration, drive: DriveEvidence, field_map: QueryableMap) -> SensorView:
     evidence = sensor_evidence(drive, sensor, field_map)
     found = curves(evidence, sensor)
     keep = evenly(len(evidence.used), READINGS)

@@ -330,6 +330,16 @@ class SensorCalibration:
         return np.concatenate([self.t_lidar_mag, self.distortion.vector()])
 
     @property
+    def used(self) -> int:
+        """How many readings counted."""
+        return 0 if self.residuals is None else self.residuals.readings
+
+    @property
+    def inside(self) -> int:
+        """How many lay inside the map: those that counted, and those that were rejected."""
+        return self.used + self.rejected
+
+    @property
     def offset_correlation(self) -> FloatArray:
         """Correlation of ``t_lidar_mag`` with the time offset, shape (3,); zero if it is held."""
         if self.time_offset is None or not self.time_offset.estimated:

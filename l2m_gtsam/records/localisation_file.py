@@ -4,9 +4,8 @@ Positions are in metres, fields in microtesla, angles in degrees, times in secon
 covariances, which are in rad and m. A number that does not exist is NaN.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any
 
 from l2m_gtsam.records.localisation import (
     DriftFigures,
@@ -20,7 +19,7 @@ from l2m_gtsam.records.localisation import (
 )
 from l2m_gtsam.records.metrics import FitFigures, MapPicture, Normalised, Row, Rows, Series
 from l2m_gtsam.records.provenance import NamedSource
-from l2m_gtsam.records.record import Record
+from l2m_gtsam.records.record import Record, Shape
 from l2m_gtsam.records.validation import ChiSquare
 from l2m_gtsam.records.verdict import Judgement
 
@@ -42,16 +41,10 @@ class PoseRecord(Record):
         translation (m), along the axes of the lidar, (6, 6); absent where it is unknown.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "p": "3",
-        "quaternion_xyzw": "4",
-        "covariance": "6 6",
-    }
-
     stamp_ns: int
-    p: Row
-    quaternion_xyzw: Row
-    covariance: Rows | None
+    p: Annotated[Row, Shape("3")]
+    quaternion_xyzw: Annotated[Row, Shape("4")]
+    covariance: Annotated[Rows | None, Shape("6 6")]
 
 
 @dataclass(frozen=True)
@@ -66,15 +59,9 @@ class OdometryRecord(Record):
         How sure it is by then: along x, y, z of the map in m, and about them in degrees.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "p": "3",
-        "quaternion_xyzw": "4",
-        "sigma": "6",
-    }
-
-    p: Row
-    quaternion_xyzw: Row
-    sigma: Row
+    p: Annotated[Row, Shape("3")]
+    quaternion_xyzw: Annotated[Row, Shape("4")]
+    sigma: Annotated[Row, Shape("6")]
 
 
 @dataclass(frozen=True)
@@ -89,17 +76,10 @@ class Timeline(Record):
         That counted, that the map does not explain, that it has no data for.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "used": "N",
-        "rejected": "N",
-        "outside": "N",
-        "edges": "N+1",
-    }
-
-    edges: Row
-    used: tuple[int, ...]
-    rejected: tuple[int, ...]
-    outside: tuple[int, ...]
+    edges: Annotated[Row, Shape("N+1")]
+    used: Annotated[tuple[int, ...], Shape("N")]
+    rejected: Annotated[tuple[int, ...], Shape("N")]
+    outside: Annotated[tuple[int, ...], Shape("N")]
 
 
 @dataclass(frozen=True)
@@ -139,18 +119,11 @@ class RefinedSensor(Record):
         of it: at most this if that covariance was true.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "before": "15",
-        "sigma_before": "15",
-        "after": "15",
-        "sigma_after": "15",
-    }
-
     sensor: str
-    before: Row
-    sigma_before: Row
-    after: Row
-    sigma_after: Row
+    before: Annotated[Row, Shape("15")]
+    sigma_before: Annotated[Row, Shape("15")]
+    after: Annotated[Row, Shape("15")]
+    sigma_after: Annotated[Row, Shape("15")]
     change: ChiSquare
 
 
@@ -188,23 +161,16 @@ class TruthRecord(Record):
         of a first pose that defines the frame.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "path": "N 3",
-        "odometry_m": "N",
-        "localised_m": "N",
-        "squared": "N",
-    }
-
     poses: int
     odometry: PoseErrors
     localised: PoseErrors
     by_scans: PoseErrors | None
     nees: float
     beyond_95: float
-    path: Rows
-    odometry_m: Row
-    localised_m: Row
-    squared: Row
+    path: Annotated[Rows, Shape("N 3")]
+    odometry_m: Annotated[Row, Shape("N")]
+    localised_m: Annotated[Row, Shape("N")]
+    squared: Annotated[Row, Shape("N")]
 
     @property
     def removed(self) -> float:
@@ -232,15 +198,9 @@ class StartCandidateRecord(Record):
         Of the readings looked at, and how they fit.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "p": "3",
-        "quaternion_xyzw": "4",
-        "covariance": "6 6",
-    }
-
-    p: Row
-    quaternion_xyzw: Row
-    covariance: Rows
+    p: Annotated[Row, Shape("3")]
+    quaternion_xyzw: Annotated[Row, Shape("4")]
+    covariance: Annotated[Rows, Shape("6 6")]
     log_likelihood: float
     inside: float
     explained: float
@@ -304,12 +264,6 @@ class LocalisationRecord(Record):
         What options would make poses better, a sentence each; none in files of older versions.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "poses": "K",
-        "odometry": "K",
-        "truth.path": "K 3",
-    }
-
     status: LocalisationStatus
     message: str
     notes: tuple[str, ...]
@@ -319,12 +273,12 @@ class LocalisationRecord(Record):
     map_errors_shared: bool
     sensors: tuple[SensorRecord, ...]
     refined: tuple[RefinedSensor, ...]
-    poses: tuple[PoseRecord, ...]
-    odometry: tuple[OdometryRecord, ...]
+    poses: Annotated[tuple[PoseRecord, ...], Shape("K")]
+    odometry: Annotated[tuple[OdometryRecord, ...], Shape("K")]
     start: StartRecord | None
     explored: Explored | None
     scans: ScanUse | None
-    truth: TruthRecord | None
+    truth: Annotated[TruthRecord | None, Shape("K 3", of="path")]
     picture: MapPicture
     sources: tuple[NamedSource, ...]
     versions: dict[str, str]

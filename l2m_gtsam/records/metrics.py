@@ -4,11 +4,10 @@ Positions are in metres, fields in microtesla, angles in degrees, times in secon
 does not exist is NaN. Rows of axes are in the order x, y, z.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated
 
-from l2m_gtsam.records.record import Record
+from l2m_gtsam.records.record import Record, Shape
 
 Row = tuple[float, ...]
 Rows = tuple[Row, ...]
@@ -94,14 +93,9 @@ class DriveRepeat(Record):
         Largest part of that difference in sigmas: of t, of C and of H.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "estimate": "15",
-        "sigma": "15",
-    }
-
     bag: str
-    estimate: Row
-    sigma: Row
+    estimate: Annotated[Row, Shape("15")]
+    sigma: Annotated[Row, Shape("15")]
     others: Halves
     largest: Row
 
@@ -195,16 +189,10 @@ class Mounting(Record):
         Which axes of the lidar its axes lie along.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "scale": "3",
-        "skew_deg": "3",
-        "turned_about": "3",
-    }
-
-    scale: Row
-    skew_deg: Row
+    scale: Annotated[Row, Shape("3")]
+    skew_deg: Annotated[Row, Shape("3")]
     angle_deg: float
-    turned_about: Row
+    turned_about: Annotated[Row, Shape("3")]
     angle_sigma_deg: float
     hard_iron: float
     axes: AxisOrder
@@ -230,17 +218,12 @@ class FitFigures(Record):
         What is left of the readings, per axis, if the field is taken to be uniform.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "mean": "3",
-        "rms": "3",
-    }
-
     readings: int
     sensor_noise: float
     map_noise: float
     pose_noise: float
-    mean: Row
-    rms: Row
+    mean: Annotated[Row, Shape("3")]
+    rms: Annotated[Row, Shape("3")]
     anomaly: float
     without_map: float
 
@@ -269,15 +252,9 @@ class Normalised(Record):
         Share of those beyond the 95 % quantile; 0.05 is consistent.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "std": "3",
-        "counts": "N",
-        "edges": "N+1",
-    }
-
-    std: Row
-    edges: Row
-    counts: tuple[int, ...]
+    std: Annotated[Row, Shape("3")]
+    edges: Annotated[Row, Shape("N+1")]
+    counts: Annotated[tuple[int, ...], Shape("N")]
     beyond_95: float
 
 
@@ -297,13 +274,8 @@ class Autocorrelation(Record):
         How many independent readings they are worth.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "lags": "N",
-        "correlation": "N",
-    }
-
-    lags: tuple[int, ...]
-    correlation: Row
+    lags: Annotated[tuple[int, ...], Shape("N")]
+    correlation: Annotated[Row, Shape("N")]
     step_s: float
     independent: float
 
@@ -327,12 +299,8 @@ class Directions(Record):
         Between the highest and the lowest angle of the field over the lidar's xy plane.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "spread": "3",
-    }
-
     covered: float
-    spread: Row
+    spread: Annotated[Row, Shape("3")]
     tilt_deg: float
 
 
@@ -350,17 +318,11 @@ class CurveErrors(Record):
         Standard deviation of the difference after the calibration per axis.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "before_axes": "3",
-        "after_axes": "3",
-        "after_std": "3",
-    }
-
     before: float
     after: float
-    before_axes: Row
-    after_axes: Row
-    after_std: Row
+    before_axes: Annotated[Row, Shape("3")]
+    after_axes: Annotated[Row, Shape("3")]
+    after_std: Annotated[Row, Shape("3")]
 
 
 @dataclass(frozen=True)
@@ -383,27 +345,15 @@ class Series(Record):
         Which drive each is of, from 0, length N; absent where there is one.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "seconds": "N",
-        "place": "N 3",
-        "residual": "N 3",
-        "normalised": "N 3",
-        "rejected": "N",
-        "before": "N 3",
-        "after": "N 3",
-        "map": "N 3",
-        "drive": "N",
-    }
-
-    seconds: Row
-    place: Rows
-    residual: Rows
-    normalised: Rows
-    rejected: tuple[bool, ...]
-    before: Rows
-    after: Rows
-    map: Rows
-    drive: tuple[int, ...] | None = None
+    seconds: Annotated[Row, Shape("N")]
+    place: Annotated[Rows, Shape("N 3")]
+    residual: Annotated[Rows, Shape("N 3")]
+    normalised: Annotated[Rows, Shape("N 3")]
+    rejected: Annotated[tuple[bool, ...], Shape("N")]
+    before: Annotated[Rows, Shape("N 3")]
+    after: Annotated[Rows, Shape("N 3")]
+    map: Annotated[Rows, Shape("N 3")]
+    drive: Annotated[tuple[int, ...] | None, Shape("N")] = None
 
 
 @dataclass(frozen=True)
@@ -439,16 +389,10 @@ class MapPicture(Record):
         Length of the field and its standard deviation per axis; NaN where the map has no data.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "extent": "4",
-        "strength": "N M",
-        "sigma": "N M",
-    }
-
-    extent: Row
+    extent: Annotated[Row, Shape("4")]
     height: float
-    strength: Rows
-    sigma: Rows
+    strength: Annotated[Rows, Shape("N M")]
+    sigma: Annotated[Rows, Shape("N M")]
 
     def __post_init__(self) -> None:
         """Raise a ValueError for a place that cannot be drawn."""
@@ -476,11 +420,7 @@ class DriveMetrics(Record):
         Share of the headings that were driven, in steps of 15 degrees.
     """
 
-    SHAPES: ClassVar[Mapping[str, str]] = {
-        "path": "N 3",
-    }
-
-    path: Rows
+    path: Annotated[Rows, Shape("N 3")]
     seconds: float
     length: float
     heave: float

@@ -1,8 +1,9 @@
 """What all records that are files have in common: numbers as JSON has them, arrays that fit."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -44,36 +45,47 @@ def _largest_of_each(value: Any) -> float:
 
 
 @dataclass(frozen=True)
+class Shape:
+    """Of an array in a field, as `N 3`: letters are lengths that arrays share, `N+1` is one more.
+
+    ``of`` names an array of the record that is in the field.
+    """
+
+    text: str
+    of: str = ""
+
+
+@dataclass(frozen=True)
 class Record:
     """A part of a file in JSON; numbers that are not finite are text there."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(ser_json_inf_nan="strings")
-    SHAPES: ClassVar[Mapping[str, str]] = {}
-    """Of arrays, as `N 3`: letters are lengths that fields share, `N+1` is one more.
-
-    `inner.field` is an array of a record in this one.
-    """
 
     def __post_init__(self) -> None:
         """Raise a ValueError for arrays whose shapes do not fit together, or with odd numbers."""
         lengths: dict[str, int] = {}
-        for name, shape in self.SHAPES.items():
-            value = self._array(name)
-            if value is not None and not _fits(value, shape.split(), lengths):
+        for name, shape in self._shapes():
+            value = getattr(self, name)
+            if shape.of and value is not None:
+                name, value = f"{name}.{shape.of}", getattr(value, shape.of)
+            if value is not None and not _fits(value, shape.text.split(), lengths):
                 known = ", ".join(f"{letter} = {length}" for letter, length in lengths.items())
                 where = f" with {known}" if known else ""
-                raise ValueError(f"{name} must have the shape ({shape}){where}")
+                raise ValueError(f"{name} must have the shape ({shape.text}){where}")
             if (largest := _largest(value)) > LARGEST:
                 raise ValueError(f"{name} has {largest:.3g}, at most {LARGEST:g} can be")
 
-    def _array(self, name: str) -> Any:
-        """Return a field, or one of a record in this one; None if either is absent."""
-        found: Any = self
-        for part in name.split("."):
-            if found is None:
-                return None
-            found = getattr(found, part)
-        return found
+    @classmethod
+    @cache
+    def _shapes(cls) -> tuple[tuple[str, Shape], ...]:
+        """Return the shapes of fields by their names, one more after what it is one more than."""
+        found = [
+            (each.name, shape)
+            for each in fields(cls)
+            for shape in getattr(each.type, "__metadata__", ())
+            if isinstance(shape, Shape)
+        ]
+        return tuple(sorted(found, key=lambda each: "+" in each[1].text))
 
 
 def fields_of(record: Record, kind: type[Record]) -> dict[str, Any]:

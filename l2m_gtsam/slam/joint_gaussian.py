@@ -6,7 +6,7 @@ given the weights has their derivatives, in a factor of few rows. With all of it
 descent took twice the time; with all of it in a linear one poses ended 0.007 sigmas off.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -180,8 +180,8 @@ def is_pose(key: int) -> bool:
     return bool(gtsam.symbolChr(key) == ord("X"))
 
 
-def prior_factors(known: JointGaussian) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the prior factors of a joint Gaussian.
+def prior_factors(known: JointGaussian) -> gtsam.NonlinearFactorGraph:
+    """Return the prior factors of a joint Gaussian.
 
     Raises
     ------
@@ -193,11 +193,13 @@ def prior_factors(known: JointGaussian) -> Iterator[gtsam.NonlinearFactor]:
     ordered = known.marginal([*weights, *poses])
     W = triangular_information_root(ordered.covariance, ROUNDING)
     count = sum(known.sizes[key] for key in weights)
+    graph = gtsam.NonlinearFactorGraph()
     if weights:
         own = {key: known.sizes[key] for key in weights}
-        yield of_vectors(known.values, own, W[:count, :count].T @ W[:count, :count])
+        graph.add(of_vectors(known.values, own, W[:count, :count].T @ W[:count, :count]))
     if poses:
-        yield whitened_difference(ordered, W[count:])
+        graph.add(whitened_difference(ordered, W[count:]))
+    return graph
 
 
 def of_vectors(

@@ -29,6 +29,7 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.sensor_models import ONE_DRIVE, Model, ModelComparison, ModelFigures, Samples
 from l2m_gtsam.solve.model_fits import Fit, Spread, compress, fit_model, inflation, spread_of
+from l2m_gtsam.solve.noise import rms
 
 PER_COLUMN = 4  # readings, at the least
 PER_SEGMENT = 4
@@ -211,8 +212,8 @@ def trial_of(samples: Samples, model: Model, fit: Fit, spread: Spread, held_out:
     # Schwarz 1978, with the effective number of parameters in place of their count, as residuals
     # are correlated.
     bic = values * np.log(fit.squares / values) + spread.freedom * np.log(values)
-    rms = _rms(fit.coefficients.residual(samples))
-    return Trial(model, fit, spread, rms, held_out, float(bic))
+    left = fit.coefficients.residual(samples)
+    return Trial(model, fit, spread, rms(left), held_out, float(bic))
 
 
 def check_samples(samples: Samples, options: ModelOptions) -> None:
@@ -288,7 +289,7 @@ def predicted(samples: Samples, segment: IntArray, models: list[Model]) -> dict[
             e = fit.coefficients.residual(held_out)
             residual[model][segment == k] = e
             scores[model][k] = np.mean(_log_density(e, fit.variance / held_out.weights))
-    return {model: HeldOut(_rms(residual[model]), scores[model]) for model in models}
+    return {model: HeldOut(rms(residual[model]), scores[model]) for model in models}
 
 
 def _log_density(residual: FloatArray, variance: FloatArray) -> FloatArray:
@@ -311,7 +312,3 @@ def _figures(trial: Trial, choice: Choice) -> ModelFigures:
         bic=trial.bic,
         bic_above=trial.above(choice.least),
     )
-
-
-def _rms(residual: FloatArray) -> float:
-    return float(np.sqrt(np.mean(residual**2)))

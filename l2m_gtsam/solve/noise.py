@@ -14,6 +14,11 @@ LEAST_LEFT = 0.5  # of a residual's variance by a fit
 HALF = 0.5  # a reading of no more weight has no part in the estimate of the noise
 
 
+def rms(values: FloatArray) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatArray) -> FloatArray:
     """Return ``C R^T V R C^T``: the map's uncertainty as a sensor sees it, uT^2, (N, 3, 3).
 
@@ -164,7 +169,7 @@ def residual_figures(residual: FloatArray, white: FloatArray, taken: float) -> R
     return ResidualFigures(
         readings=len(residual),
         rms_axes=np.sqrt(np.mean(residual**2, axis=0)),
-        rms=float(np.sqrt(np.mean(norm**2))),
+        rms=rms(norm),
         median_norm=float(np.median(norm)),
         p95_norm=float(np.quantile(norm, 0.95)),
         max_norm=float(norm.max()),

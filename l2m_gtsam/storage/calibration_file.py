@@ -135,6 +135,12 @@ MODEL = {
     "traces": "some poses of each drive, by which validate recognises it whatever file it is in",
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
+ABOUT_ERRORS = (
+    *("uncertainty", "doubts", "notes", "exact", "disturbances", "stated", "pose_duration"),
+    "unseen_warp_m",
+)
+ABOUT_ORIGIN = ("recorded", "map_origin", "traces", "versions", "iterations")
+"""Fields of a result as the file has them, in its order."""
 OPTIONAL = (
     *("notes", "exact", "disturbances", "stated", "pose_duration", "unseen_warp_m"),
     *("traces", "sources", "metrics_sha256", "recorded", "map_origin"),
@@ -187,22 +193,11 @@ def calibration_content(result: CalibrationResult) -> dict[str, Any]:
         "metrics_sha256": plain["metrics_sha256"],
         **judged,
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
-        "uncertainty": plain["uncertainty"],
-        "doubts": plain["doubts"],
-        "notes": plain["notes"],
-        "exact": plain["exact"],
-        "disturbances": plain["disturbances"],
-        "stated": plain["stated"],
-        "pose_duration": plain["pose_duration"],
-        "unseen_warp_m": plain["unseen_warp_m"],
+        **{name: plain[name] for name in ABOUT_ERRORS},
         "disagreements": disagreements,
         "sources": plain["sources"],
         **source_entries(result),
-        "recorded": plain["recorded"],
-        "map_origin": plain["map_origin"],
-        "traces": plain["traces"],
-        "versions": plain["versions"],
-        "iterations": plain["iterations"],
+        **{name: plain[name] for name in ABOUT_ORIGIN},
         "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
         "options": plain["options"],
     }

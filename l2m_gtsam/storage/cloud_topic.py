@@ -16,7 +16,6 @@ from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import VoxelMeans, located
 from l2m_gtsam.storage.log import Message
-from l2m_gtsam.storage.messages import header_ns
 from l2m_gtsam.storage.open_bag import open_bag
 from l2m_gtsam.storage.point_cloud2 import cloud_connections, points_of, times_of
 from l2m_gtsam.storage.point_table import MAX_POINTS
@@ -103,8 +102,7 @@ def read_cloud_topic(
     merged = _MergedScans(f"{path}: topic {topic}", trajectory, options)
     with open_bag(path) as bag:
         for message in bag.messages(cloud_connections(bag, topic), progress):
-            is_record = stamps is Stamps.RECORD
-            merged.add(message, message.record_ns if is_record else header_ns(message.content))
+            merged.add(message, message.stamp_ns(stamps))
     return merged.cloud()
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import TextIO
 
 from l2m_gtsam.data import SourceFile
 from l2m_gtsam.errors import L2MError, NoRoomError, OutputError
@@ -118,16 +118,6 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", errors="replace")
 
 
-CHUNK_BYTES = 1 << 20
-
-
-class Hasher(Protocol):
-    """What takes in bytes."""
-
-    def update(self, data: bytes, /) -> None:
-        """Take in bytes."""
-
-
 def source_file(path: Path) -> SourceFile:
     """Return the SHA-256 of a file, or of all files in a folder.
 
@@ -146,28 +136,25 @@ def source_file(path: Path) -> SourceFile:
     """
     digest = hashlib.sha256()
     try:
-        if path.is_dir():
-            _take_folder(digest, path)
-        else:
-            _take_file(digest, path)
+        for head, file in _hashed(path):
+            digest.update(head)
+            with open_regular(file) as content:
+                hashlib.file_digest(content, lambda: digest)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise L2MError(f"{path}: cannot be read: {reason}") from error
     return SourceFile(str(path), digest.hexdigest())
 
 
-def _take_folder(digest: Hasher, folder: Path) -> None:
-    files = {file.relative_to(folder).as_posix(): file for file in folder.rglob("*")}
+def _hashed(path: Path) -> Iterator[tuple[bytes, Path]]:
+    """Yield a file, or those in a folder, with what is hashed before the content of each."""
+    if not path.is_dir():
+        yield b"", path
+        return
+    files = {file.relative_to(path).as_posix(): file for file in path.rglob("*")}
     for name, file in sorted(files.items()):
         if file.is_file():
-            digest.update(f"{name}\0{file.stat().st_size}\0".encode())
-            _take_file(digest, file)
-
-
-def _take_file(digest: Hasher, path: Path) -> None:
-    with open_regular(path) as file:
-        while chunk := file.read(CHUNK_BYTES):
-            digest.update(chunk)
+            yield f"{name}\0{file.stat().st_size}\0".encode(), file
 
 
 LONGEST = 60  # letters: four bytes each and a digest are still a name for every file system

@@ -93,23 +93,13 @@ class TableLog:
     """A log whose topics are tables in memory."""
 
     def __init__(self, path: Path, channels: Sequence[TableTopic]) -> None:
-        self._path = path
+        self.path = path
         self._channels = tuple(channels)
         text = MessageDefinition(MessageDefinitionFormat.NONE, "")
-        self._connections = tuple(
+        self.connections = tuple(
             Connection(index, c.topic, c.msgtype, text, "", len(c.stamp_ns), TableExt(c.unit), None)  # type: ignore[arg-type]
             for index, c in enumerate(self._channels)
         )
-
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self._path
-
-    @property
-    def connections(self) -> Sequence[Connection]:
-        """Its topics."""
-        return self._connections
 
     @property
     def duration_s(self) -> float:

@@ -91,22 +91,13 @@ class Bag:
 
     def __init__(self, path: Path, reader: Ros1Reader | Ros2Reader) -> None:
         self.path = path
-        self._reader = reader
-
-    @property
-    def connections(self) -> Sequence[Connection]:
-        """Every connection of the bag."""
-        return self._reader.connections
+        self.reader = reader
+        self.connections: Sequence[Connection] = reader.connections
 
     @property
     def duration_s(self) -> float:
         """Time between the first and the last record in seconds."""
-        return self._reader.duration * 1e-9
-
-    @property
-    def reader(self) -> Ros1Reader | Ros2Reader:
-        """What reads it, for those who copy it."""
-        return self._reader
+        return self.reader.duration * 1e-9
 
     def messages(
         self, connections: Sequence[Connection], progress: Count | None = None
@@ -135,7 +126,7 @@ class Bag:
         """Yield the messages of these connections as ``messages`` does, but not decoded."""
         if not connections:
             return
-        stream, received = self._reader.messages(list(connections)), 0
+        stream, received = self.reader.messages(list(connections)), 0
         promised = sum(c.msgcount for c in connections)
         while True:
             if progress is not None and received % PROGRESS_EVERY == 0:
@@ -172,7 +163,7 @@ class Bag:
         """
         # tf/tfMessage, which ROS1 used before tf2, has the layout of its successor.
         msgtype = TF_TYPE if connection.msgtype in TF_TYPES else connection.msgtype
-        is_ros1 = isinstance(self._reader, Ros1Reader)
+        is_ros1 = isinstance(self.reader, Ros1Reader)
         try:
             store = typestore(is_ros1, msgtype, connection.msgdef)
         except Exception as error:

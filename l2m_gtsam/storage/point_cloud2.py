@@ -14,7 +14,6 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
 from l2m_gtsam.records.scans import Scan, ScanOptions
 from l2m_gtsam.storage.bag_options import Stamps
-from l2m_gtsam.storage.messages import header_ns
 from l2m_gtsam.storage.open_bag import Bag, open_bag
 from l2m_gtsam.storage.open_log import is_table
 from l2m_gtsam.storage.point_table import stacked
@@ -191,7 +190,7 @@ class ScanTopic:
         with open_bag(self.path) as bag:
             for message in bag.messages(chosen_cloud_topic(bag, self.topic), self.progress):
                 content, where = message.content, f"{self.path}: topic {message.connection.topic}"
-                stamp = message.record_ns if self.stamps is Stamps.RECORD else header_ns(content)
+                stamp = message.stamp_ns(self.stamps)
                 if frame not in (None, content.header.frame_id):
                     raise BagError(
                         f"{where}: has scans in several frames ({frame}, "

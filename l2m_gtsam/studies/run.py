@@ -107,34 +107,22 @@ def run_study(
         See ``computed``.
     """
     with made(out), only_one(out):
-        return _run(study, options, out, cluster, progress, command)
-
-
-def _run(
-    study: Study[Opts, Cell, Summary],
-    options: Opts,
-    out: Path,
-    cluster: ClusterOptions,
-    progress: Progress,
-    command: str,
-) -> StudyFile[Opts, Summary]:
-    """Compute and write a study in a folder that no other run writes to."""
-    keys = study.keys(options)
-    folder = CellFolder.opened(out / CELLS, study, options)
-    finished = {key: cell for key in keys if (cell := folder.read(key)) is not None}
-    missing = [key for key in keys if key not in finished]
-    report = counter(study.name, progress)
-    report(len(finished), len(keys))
-    work = Work(
-        partial(study.site, options),
-        partial(study.prepare, options),
-        partial(computed_cell, study, options),
-    )
-    for key, cell in computed(work, missing, cluster):
-        folder.write(key, cell)
-        finished[key] = cell
+        keys = study.keys(options)
+        folder = CellFolder.opened(out / CELLS, study, options)
+        finished = {key: cell for key in keys if (cell := folder.read(key)) is not None}
+        missing = [key for key in keys if key not in finished]
+        report = counter(study.name, progress)
         report(len(finished), len(keys))
-    return conclude(study, options, {key: finished[key] for key in keys}, out, command)
+        work = Work(
+            partial(study.site, options),
+            partial(study.prepare, options),
+            partial(computed_cell, study, options),
+        )
+        for key, cell in computed(work, missing, cluster):
+            folder.write(key, cell)
+            finished[key] = cell
+            report(len(finished), len(keys))
+        return conclude(study, options, {key: finished[key] for key in keys}, out, command)
 
 
 def computed_cell(

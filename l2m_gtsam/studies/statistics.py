@@ -4,6 +4,7 @@ Errors of calibrations on one survey are not independent, because they share its
 here therefore comes in a form that takes only surveys for independent.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -149,3 +150,19 @@ class Share:
         """Wilson's 95 % interval of the probability."""
         band = wilson_interval(self.rate, self.trials)
         return band.low, band.high
+
+
+def in_percent(
+    shares: Sequence[float], intervals: Sequence[tuple[float, float]]
+) -> tuple[FloatArray, FloatArray]:
+    """Return N shares, and how far their intervals reach below and above them, (N,) and (2, N)."""
+    share = 100 * np.array(shares)
+    low, high = 100 * np.array(intervals).reshape(-1, 2).T
+    # Rounding may put the end of an interval a hair on the wrong side of the share.
+    return share, np.maximum([share - low, high - share], 0.0)
+
+
+def mean_of(values: Sequence[float | None]) -> float | None:
+    """Return the mean of what is stated; None of nothing."""
+    stated = [each for each in values if each is not None]
+    return float(np.mean(stated)) if stated else None

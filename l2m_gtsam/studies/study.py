@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar, get_args
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
@@ -32,7 +32,7 @@ class Study(ABC, Generic[Opts, Cell, Summary]):
         Names of the options that only set the number of cells: finished cells remain valid when
         these change.
     options, cell, summary
-        Classes of options, cells and summary.
+        Classes of options, cells and summary, those in brackets behind ``Study``.
     """
 
     name: ClassVar[str]
@@ -41,6 +41,11 @@ class Study(ABC, Generic[Opts, Cell, Summary]):
     options: type[Opts]
     cell: type[Cell]
     summary: type[Summary]
+
+    def __init_subclass__(cls) -> None:
+        """Take the classes from the brackets behind ``Study``."""
+        (study,) = cls.__orig_bases__  # type: ignore[attr-defined]
+        cls.options, cls.cell, cls.summary = get_args(study)
 
     @abstractmethod
     def keys(self, options: Opts) -> tuple[str, ...]:

@@ -41,9 +41,6 @@ class ToyStudy(Study[ToyOptions, ToyCell, ToySummary]):
     name = "toy"
     title = "Random numbers"
     size = frozenset({"cells", "seconds", "log", "deadly"})
-    options = ToyOptions
-    cell = ToyCell
-    summary = ToySummary
 
     def keys(self, options: ToyOptions) -> tuple[str, ...]:
         return tuple(f"cell-{number}" for number in range(options.cells))

@@ -80,6 +80,12 @@ class ReadingPlaces:
         bend = field_bend(readings, field_map, t, b_lidar)
         return cls(readings, t, C, x, b_lidar, R_lidar_map @ gradient, bend)
 
+    def pose_features(self, rows: IntArray) -> FloatArray:
+        """Return what a unit of each error of poses does to the field, lidar frame, (n, 3, 6)."""
+        unit = np.broadcast_to(np.eye(6), (len(rows), 6, 6))
+        slope = self.slope[rows] @ self.readings.R_map_lidar[rows]
+        return pose_features(unit, self.b_lidar[rows], slope, self.t[rows])
+
 
 def field_bend(
     readings: Readings, field_map: DifferentiableMap, t: FloatArray, b_lidar: FloatArray
@@ -206,19 +212,6 @@ def lasting(modes: TimeModes, seconds: float) -> FloatArray:
     return np.asarray(2 * share / (1 + (np.pi * modes.frequency * share) ** 2))
 
 
-def named_noise_and_walk(modes: TimeModes, sizes: FloatArray) -> dict[str, float]:
-    """Return the names of the parts of ``pink_and_walk``."""
-    whole = np.sum(1 / np.arange(1.0, modes.count + 1))
-    noise, walk = np.sqrt(sizes * [whole, 1.0]).tolist()
-    return {"noise_ut": noise, "walk_ut": walk}
-
-
-def pink_and_walk(modes: TimeModes) -> FloatArray:
-    """Return spectra of 1/f noise and of a random walk of a vector, shape (2, 3 D J)."""
-    j = np.repeat(modes.frequency, 3)
-    return np.stack([1 / j, 1 / (np.pi * j) ** 2])
-
-
 def times_modes(features: FloatArray, modes: FloatArray) -> FloatArray:
     """Return what weights of J modes, (n, J), of a quantities do, (n, 3, a): shape (n, 3, J a)."""
     product = np.einsum("nia,nj->nija", features, modes)
@@ -226,26 +219,35 @@ def times_modes(features: FloatArray, modes: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Wander(Process):
-    """H of a sensor wanders: 1/f noise, a random walk, or both."""
+class NoiseAndWalk(Process):
+    """A field that has 1/f noise, a random walk, or both."""
 
-    sensor: int
     modes: TimeModes
-    kind = DisturbanceKind.WANDER
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
         """Of 1/f noise and of a random walk together, uT^2."""
-        return (pink_and_walk(self.modes),)
+        j = np.repeat(self.modes.frequency, 3)
+        return (np.stack([1 / j, 1 / (np.pi * j) ** 2]),)
+
+    def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
+        """Return noise and walk, uT."""
+        whole = np.sum(1 / np.arange(1.0, self.modes.count + 1))
+        noise, walk = np.sqrt(sizes * [whole, 1.0]).tolist()
+        return {"noise_ut": noise, "walk_ut": walk}
+
+
+@dataclass(frozen=True)
+class Wander(NoiseAndWalk):
+    """H of a sensor wanders."""
+
+    sensor: int
+    kind = DisturbanceKind.WANDER
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what adds to the readings along their axes, shape (n, 3, m)."""
         along = right_divided(np.eye(3), self.places.C[rows])
         return times_modes(along, self.modes.values(self.places.readings, rows))
-
-    def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
-        """Return noise and walk, uT."""
-        return named_noise_and_walk(self.modes, sizes)
 
 
 @dataclass(frozen=True)
@@ -264,10 +266,8 @@ class PoseProcess(Process):
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what rotations and translations make of the field, shape (n, 3, m)."""
-        places, unit = self.places, np.broadcast_to(np.eye(6), (len(rows), 6, 6))
-        slope = places.slope[rows] @ places.readings.R_map_lidar[rows]
-        F = pose_features(unit, places.b_lidar[rows], slope, places.t[rows])
-        return times_modes(F, self.modes.values(places.readings, rows))
+        F = self.places.pose_features(rows)
+        return times_modes(F, self.modes.values(self.places.readings, rows))
 
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return what each part is wrong by, and how long it lasts."""
@@ -282,27 +282,17 @@ class PoseProcess(Process):
 
 
 @dataclass(frozen=True)
-class FieldProcess(Process):
+class FieldProcess(NoiseAndWalk):
     """The field is not the map's for a time: it changed, or the map misses what is on the way."""
 
-    modes: TimeModes
     sensor: int | None = field(default=None, kw_only=True)
     kind = DisturbanceKind.FIELD
-
-    @cached_property
-    def forms(self) -> tuple[FloatArray, ...]:
-        """Of 1/f noise and of a random walk together, uT^2."""
-        return (pink_and_walk(self.modes),)
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what fields along the axes of the map are in the lidar frame, shape (n, 3, m)."""
         readings = self.places.readings
         R_lidar_map = readings.R_map_lidar[rows].transpose(0, 2, 1)
         return times_modes(R_lidar_map, self.modes.values(readings, rows))
-
-    def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
-        """Return noise and walk, uT."""
-        return named_noise_and_walk(self.modes, sizes)
 
 
 @dataclass(frozen=True)
@@ -386,10 +376,9 @@ class Warp(Process):
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what shifts along x and y of the map make of the field, shape (n, 3, m)."""
-        places, unit = self.places, np.broadcast_to(np.eye(6), (len(rows), 6, 6))
-        R, p = places.readings.R_map_lidar[rows], places.readings.p_map_lidar[rows]
-        slope = places.slope[rows]
-        F = pose_features(unit, places.b_lidar[rows], slope @ R, places.t[rows])
+        readings, slope = self.places.readings, self.places.slope[rows]
+        F = self.places.pose_features(rows)
+        R, p = readings.R_map_lidar[rows], readings.p_map_lidar[rows]
         turn = np.einsum("nia,na->ni", F[:, :, :3], R[:, 2])  # about the map's vertical axis
         curl = self.modes.slopes(p)[:, :, ::-1] * [-1.0, 1.0]  # of a shift along x, and along y
         by_turn = np.einsum("ni,nja->nija", turn, 0.5 * curl).reshape(len(rows), 3, -1)

@@ -12,6 +12,7 @@ from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.solve.noise import rms
 
 FOLDS = 4
 PATCH = 0.6  # metres; about as far as the space between two lanes of a survey
@@ -160,8 +161,3 @@ def explanation_of(
         noise=shared.noise,
         sensor_noise=sensor_noise,
     )
-
-
-def rms(values: FloatArray) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(values**2)))

@@ -11,7 +11,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import COARSE, Basis, basis_of
 from l2m_gtsam.maps.harmonic.evidence import Normal, evidence, normal_of
 from l2m_gtsam.maps.harmonic.family import BOUNDS, Hyperparameters
-from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters
+from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters, moved
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import (
     FINER,
@@ -163,7 +163,7 @@ def draw_windows(
         rows = rng.permutation(members[tile])[: learning.readings]
         return window_of(readings[np.sort(rows)], sources, tiling, tile, resolution)
 
-    spread = spread_tiles(tiling, [len(rows) for rows in members], learning.windows)
+    spread = spread_tiles(tiling, members, learning.windows)
     rough = rough_tiles(readings, members, learning.rough, spread)
     return Windows([window(tile) for tile in spread], [window(tile) for tile in rough])
 
@@ -195,7 +195,7 @@ def maximise(
     low, high = np.maximum(low, x0 - FURTHEST), np.minimum(high, x0 + FURTHEST)
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:
-        trial = start.model_copy(update=dict(zip(names, np.exp(x).tolist(), strict=True)))
+        trial = moved(start, names, x)
         # Windows count as independent, so that likelihoods add (composite likelihood; Varin, Reid
         # and Firth 2011).
         parts = in_threads(lambda window: log_likelihood(window, trial), windows)
@@ -215,9 +215,7 @@ def maximise(
     on_bound = np.minimum(end.x - low, high - end.x) < BOUND_TOLERANCE
     at_bound = tuple(name for name, on in zip(names, on_bound, strict=True) if on)
     return LearningEnd(
-        hyperparameters=start.model_copy(
-            update=dict(zip(names, np.exp(end.x).tolist(), strict=True))
-        ),
+        hyperparameters=moved(start, names, end.x),
         log_likelihood=-float(end.fun),
         readings=sum(window.normal.rows for window in windows) // 3,
         converged=bool(end.success) and not at_bound,

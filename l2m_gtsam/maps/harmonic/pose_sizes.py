@@ -130,11 +130,9 @@ def pose_sizes(
     noise_known
         Whether the map's noise is that of readings beside these errors; else it has them in it.
     """
-    some = spread_tiles(learnt.tiling, [len(rows) for rows in learnt.members], MOST_TILES)
 
     def seen(unit: FloatArray, lasting_s: float) -> list[PoseView]:
-        of_unit = replace(poses, sizes=unit, lasting_s=lasting_s)
-        return in_threads(partial(pose_view, learnt, tiles, of_unit), some)
+        return pose_views(learnt, tiles, poses.sized(unit, lasting_s))
 
     return most_likely(seen, learnt.hyperparameters.noise, noise_known=noise_known)
 
@@ -186,15 +184,13 @@ def lasting(learnt: Learnt, tiles: Tiles, poses: SurveyPoses) -> bool:
 
     Errors that every pose has of its own are noise of each reading, which a map has learnt.
     """
-    some = spread_tiles(learnt.tiling, [len(rows) for rows in learnt.members], MOST_TILES)
-    seen = in_threads(partial(pose_view, learnt, tiles, poses), some)
+    seen = pose_views(learnt, tiles, poses)
     return sum(each.system.posterior(np.ones(len(each.part))).likelihood for each in seen) > 0
 
 
 def noise_beside(learnt: Learnt, tiles: Tiles, poses: SurveyPoses) -> float:
     """Return the share of the noise's variance that is left beside errors of stated sizes."""
-    some = spread_tiles(learnt.tiling, [len(rows) for rows in learnt.members], MOST_TILES)
-    seen = in_threads(partial(pose_view, learnt, tiles, poses), some)
+    seen = pose_views(learnt, tiles, poses)
     return noise_left(
         [each.system for each in seen],
         [np.ones(len(each.part)) for each in seen],
@@ -210,6 +206,12 @@ def likely(views: Sequence[PoseView], parts: IntArray, *, known: bool) -> Varian
     sizes = np.zeros(PARTS.max() + 1)
     sizes[parts] = found.sizes
     return replace(found, sizes=sizes)
+
+
+def pose_views(learnt: Learnt, tiles: Tiles, poses: SurveyPoses) -> list[PoseView]:
+    """Return what some tiles, each by itself, say of the errors of poses."""
+    some = spread_tiles(learnt.tiling, learnt.members, MOST_TILES)
+    return in_threads(partial(pose_view, learnt, tiles, poses), some)
 
 
 def pose_view(learnt: Learnt, tiles: Tiles, poses: SurveyPoses, index: int) -> PoseView:
@@ -308,8 +310,7 @@ def relearnt(learnt: Learnt, options: HarmonicOptions) -> Learnt:
     """Return the same with scales and depths learnt beside the errors of the poses."""
     if options.hyperparameters is not None:
         return learnt
-    members = learnt.members
-    some = spread_tiles(learnt.tiling, [len(rows) for rows in members], options.learning.windows)
+    some = spread_tiles(learnt.tiling, learnt.members, options.learning.windows)
     end = maximise([window(learnt, tile) for tile in some], learnt.hyperparameters, ("noise",))
     return replace(learnt, hyperparameters=end.hyperparameters)
 

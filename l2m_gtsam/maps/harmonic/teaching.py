@@ -86,7 +86,7 @@ def explained(learnt: Learnt, options: HarmonicOptions) -> Learnt:
     """Return the same with a verdict from a few of its tiles."""
     members = [learnt.present(tile) for tile in range(len(learnt.tiling))]
     works = []
-    spread = spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED)
+    spread = spread_tiles(learnt.tiling, members, JUDGED)
     for tile in spread + rough_tiles(learnt.readings, members, JUDGED_ROUGH, spread):
         rows = evenly(members[tile], options.learning.readings)
         basis = learnt.basis(tile, rows, COARSE)

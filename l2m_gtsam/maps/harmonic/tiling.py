@@ -236,11 +236,12 @@ def tiling_of(
     return Tiling(grid, options.overlap, options.margin, blend)
 
 
-def spread_tiles(tiling: Tiling, counts: Sequence[int], number: int) -> list[int]:
-    """Return tiles far from each other among those with many readings."""
-    rich = np.flatnonzero(np.asarray(counts) >= np.median(counts))
+def spread_tiles(tiling: Tiling, members: Sequence[IntArray], number: int) -> list[int]:
+    """Return tiles far from each other among those with many readings, by the rows of each."""
+    counts = np.array([len(rows) for rows in members])
+    rich = np.flatnonzero(counts >= np.median(counts))
     centres = tiling.grid.centres[rich]
-    chosen = [int(np.argmax(np.asarray(counts)[rich]))]
+    chosen = [int(np.argmax(counts[rich]))]
     away = np.full(len(rich), np.inf)
     while len(chosen) < min(number, len(rich)):
         away = np.minimum(away, np.linalg.norm(centres - centres[chosen[-1]], axis=1))

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, IntArray, Recording, Trajectory
-from l2m_gtsam.qa.metrics.evidence import DriveEvidence, Queryable, SensorEvidence, sensor_evidence
+from l2m_gtsam.qa.metrics.evidence import DriveEvidence, SensorEvidence, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import (
     autocorrelation,
     curve_errors,
@@ -65,7 +66,7 @@ class SeenSensors:
 
     @classmethod
     def of(
-        cls, result: CalibrationResult, drive: DriveEvidence, field_map: Queryable
+        cls, result: CalibrationResult, drive: DriveEvidence, field_map: QueryableMap
     ) -> "SeenSensors":
         """Return this of the sensors that were solved."""
         solved = solved_sensors(result)
@@ -157,7 +158,7 @@ class MapSlice:
 
 
 def slice_map(
-    field_map: Queryable, low: FloatArray, high: FloatArray, height: float, cells: int
+    field_map: QueryableMap, low: FloatArray, high: FloatArray, height: float, cells: int
 ) -> MapSlice:
     """Return a map on a horizontal grid.
 
@@ -184,7 +185,7 @@ def slice_map(
     )
 
 
-def map_picture(field_map: Queryable, places: FloatArray) -> MapPicture:
+def map_picture(field_map: QueryableMap, places: FloatArray) -> MapPicture:
     """Return the map around places, shape (N, 3), at their middle height, coarsely."""
     low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
     around = min(AROUND * max(float((high - low).max()), 1.0), MOST_AROUND_M)

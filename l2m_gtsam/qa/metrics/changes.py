@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, FloatArray, same_content
+from l2m_gtsam.geometry import propagated
 from l2m_gtsam.qa.metrics.mounting import PAIRS, gains, sensor_axes, skews_deg
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.recording.drive_trace import same_drive
@@ -151,15 +152,13 @@ def differences(
     new: SensorCalibration, old: SensorCalibration, whole: CalibrationDifference
 ) -> dict[CalibrationPart, CalibrationDifference]:
     """Return the differences of a calibration's parts, in the units of ``CalibrationChange``."""
-    jacobians = [shape_derivatives(s.distortion.C) for s in (new, old)]
     shapes = [
         np.concatenate([gains(s.distortion.C), skews_deg(s.distortion.C)]) for s in (new, old)
     ]
-    spread = sum(
-        (through(J, s.covariance[3:12, 3:12]) for J, s in zip(jacobians, (new, old), strict=True)),
-        np.zeros((6, 6)),
-    )
-    shape = CalibrationDifference(shapes[0] - shapes[1], spread)
+    spreads = [
+        propagated(shape_derivatives(s.distortion.C), s.covariance[3:12, 3:12]) for s in (new, old)
+    ]
+    shape = CalibrationDifference(shapes[0] - shapes[1], spreads[0] + spreads[1])
     return {
         CalibrationPart.PLACE: whole.part(slice(0, 3)),
         CalibrationPart.ROTATION: rotation_difference(new, old),
@@ -179,21 +178,9 @@ def rotation_difference(new: SensorCalibration, old: SensorCalibration) -> Calib
     if not np.isfinite(turn).all():
         return CalibrationDifference(np.full(3, np.nan), np.diag(np.full(3, np.inf)))
     d = Rotation.from_matrix(turn).as_rotvec()
-    spread = new.rotation_covariance + through(turn.T, old.rotation_covariance)
+    spread = new.rotation_covariance + propagated(turn.T, old.rotation_covariance)
     degree = np.rad2deg(1.0)
     return CalibrationDifference(degree * d, degree**2 * spread)
-
-
-def through(J: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return ``J covariance J^T``; what rests on an infinite variance is infinite itself."""
-    unknown = ~np.isfinite(np.diag(covariance))
-    # The delta method; 0 * inf is no number, so that infinite variances are propagated apart.
-    finite = np.where(unknown[:, None] | unknown, 0.0, covariance)
-    result = J @ finite @ J.T
-    open_ = np.abs(J[:, unknown]).max(axis=1, initial=0.0) > 1e-9  # zero but for rounding
-    result[open_, :] = result[:, open_] = 0.0
-    result[open_, open_] = np.inf
-    return np.asarray(result)
 
 
 def shape_derivatives(C: FloatArray) -> FloatArray:

@@ -1,20 +1,13 @@
 """Readings of one sensor beside what map and calibration make of them."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
-
-
-class Queryable(Protocol):
-    """What metrics ask of a map."""
-
-    def query(self, points: FloatArray, /) -> FieldSample:
-        """Return field, gradient, variance and whether the map has data there."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +68,7 @@ class SensorEvidence:
 
 
 def sensor_evidence(
-    drive: DriveEvidence, sensor: SensorCalibration, field_map: Queryable
+    drive: DriveEvidence, sensor: SensorCalibration, field_map: QueryableMap
 ) -> SensorEvidence:
     """Return what map and calibration make of the readings of one sensor that was solved."""
     index = drive.readings.sensors.index(sensor.sensor)

@@ -17,6 +17,7 @@ from l2m_gtsam.records.localisation_file import (
     TruthRecord,
 )
 from l2m_gtsam.solve.chi_square import quantile
+from l2m_gtsam.solve.noise import rms
 
 HEADING = 5  # of x, y, z, and rotations about them
 
@@ -130,7 +131,7 @@ class Compared:
     def figures(self) -> PoseErrors:
         """Return root mean squares and the largest."""
         m, deg = self.distance, self.angle
-        return PoseErrors(_rms(m), float(m.max()), _rms(deg), float(deg.max()))
+        return PoseErrors(rms(m), float(m.max()), rms(deg), float(deg.max()))
 
 
 def compared(truth: Trajectory, found: Trajectory) -> Compared:
@@ -224,7 +225,3 @@ def _spread(values: FloatArray, there: BoolArray) -> FloatArray:
     spread = np.full(len(there), np.nan)
     spread[there] = values
     return spread
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

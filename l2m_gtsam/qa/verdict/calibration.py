@@ -275,8 +275,6 @@ def measured(
     options
         Thresholds.
     """
-    used = 0 if sensor.residuals is None else sensor.residuals.readings
-    inside = used + sensor.rejected
     turned = np.rad2deg(np.sqrt(np.diag(sensor.rotation_covariance)))
     chi2 = np.nan if sensor.residuals is None else sensor.residuals.chi2_per_dof
     apart, passes = furthest_shown(found.halves, options)
@@ -290,11 +288,11 @@ def measured(
             _in("halves apart, over what chance allows", "", apart, options.halves_apart),
             passes=passes,
         ),
-        _in("rejected", "%", _share(sensor.rejected, inside), options.rejected, 100),
+        _in("rejected", "%", _share(sensor.rejected, sensor.inside), options.rejected, 100),
         _in(
             "outside the map",
             "%",
-            _share(sensor.outside_map, inside + sensor.outside_map),
+            _share(sensor.outside_map, sensor.inside + sensor.outside_map),
             options.outside_map,
             100,
         ),

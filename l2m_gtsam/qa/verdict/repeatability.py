@@ -165,9 +165,8 @@ def _meaning(case: Case, level: Level, difference: str) -> tuple[Level, str]:
     """Return what it means: other sensors saw the same map from the same poses."""
     others = [each for each in case.others if _compared(each)]
     same = [differing(each, case.options) is None for each in others]
-    used = 0 if case.sensor.residuals is None else case.sensor.residuals.readings
     # A reading or two say nothing about the others: as many as are worth a warning by themselves.
-    disturbed = case.sensor.rejected > case.options.rejected.warn * (used + case.sensor.rejected)
+    disturbed = case.sensor.rejected > case.options.rejected.warn * case.sensor.inside
     if same and sum(same) > len(same) / 2 and level is Level.FAIL:
         return level, (
             f"It does not hold still: {difference}, while other sensors repeat. It moved on its "

@@ -141,9 +141,7 @@ def fit(case: Case) -> list[Reason]:
     """Return what of the readings is not explained, and how many there are."""
     sensor, options = case.sensor, case.options
     reasons = [*_explained(case), *_consistent(case)]
-    used = 0 if sensor.residuals is None else sensor.residuals.readings
-    inside = used + sensor.rejected
-    if inside:
+    if inside := sensor.inside:
         share = sensor.rejected / inside
         text = f"{share:.0%} of its readings fit neither map nor distortion and do not count."
         reasons += options.rejected.reasons(share, text)

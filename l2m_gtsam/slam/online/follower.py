@@ -154,23 +154,20 @@ class Follower:
         over_m: float,
         *,
         free: bool,
-        section: int = SECTION,
     ) -> "Follower":
         """Return a follower that goes on from what was known of a key pose."""
         belief, number = last.belief, last.number
         pose = belief.pose
         T_map_lidar = as_transform(pose)
         start = StartPose(T_map_lidar, belief.pose_covariance)
-        own = cls(start, belief.sensors, field_map, robust, over_m, free=free, section=section)
+        own = cls(start, belief.sensors, field_map, robust, over_m, free=free)
         values, sizes = gtsam.Values(), {X(number): POSE}
         values.insert(X(number), pose)
         if free:
             values.insert(calibration_values(belief.sensors))
             for i in range(len(belief.sensors.names)):
                 sizes |= {T(i): POSITION, D(i): DISTORTION}
-        prior = gtsam.NonlinearFactorGraph()
-        for factor in prior_factors(JointGaussian(values, sizes, belief.covariance)):
-            prior.add(factor)
+        prior = prior_factors(JointGaussian(values, sizes, belief.covariance))
         own._belief, own._pending, own._drift = belief, PendingKeyPoses(), last.drift
         own._first = own._last = number
         own._section.add(prior, values, number, 0)

@@ -1,7 +1,5 @@
 """The last key poses of a drive, solved incrementally by iSAM2; earlier ones are a prior."""
 
-from dataclasses import dataclass, field
-
 import gtsam
 import numpy as np
 
@@ -19,14 +17,6 @@ RELINEARISE = {
 }
 CHOLESKY, QR = "CHOLESKY", "QR"
 ANEW = 10  # iterations of a section that is solved again from its beginning
-
-
-@dataclass
-class SectionContents:
-    """All that was added to a section: factors and initial values."""
-
-    graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
-    values: gtsam.Values = field(default_factory=gtsam.Values)
 
 
 class Section:
@@ -49,7 +39,7 @@ class Section:
 
     def __init__(self, calibrations: list[int], solver: str = CHOLESKY) -> None:
         self._engine, self._calibrations, self._solver = _engine(solver), calibrations, solver
-        self._contents = SectionContents()
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()  # all so far
         self._observed: set[int] = set()  # calibrations of sensors with readings
 
     def add(
@@ -60,13 +50,13 @@ class Section:
             keys = set(graph.at(n).keys())
             if not keys.issubset(self._calibrations):
                 self._observed |= keys.intersection(self._calibrations)
-        self._contents.graph.push_back(graph)
-        self._contents.values.insert(values)
+        self._graph.push_back(graph)
+        self._values.insert(values)
         if self._solver == QR:
             self._update(graph, values, last, again)
         elif unless_indeterminate(lambda: self._update(graph, values, last, again)) is None:
             self._solver, self._engine = QR, _engine(QR)
-            self._update(self._contents.graph, self._contents.values, last, ANEW)
+            self._update(self._graph, self._values, last, ANEW)
 
     def _update(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int

@@ -200,8 +200,7 @@ class OpenSection:
         """
         self._share([X(origin) for each in new for origin in each.links.origin.tolist()])
         graph, shared = self._motions(), [key for key in self._shared if is_pose(key)]
-        for factor in prior_factors(self._memory.known.marginal(shared)):
-            graph.add(factor)
+        graph.push_back(prior_factors(self._memory.known.marginal(shared)))
         poses = [*shared, *(X(each.number) for each in self._key_poses)]
         values, most = part_of(self._values, poses), self._options.max_iterations
         order = colamd_ordering(graph)
@@ -336,9 +335,7 @@ class OpenSection:
     def _prior_factors(self) -> gtsam.NonlinearFactorGraph:
         """Return the memory's factors on the variables that it shares."""
         if self._prior is None:
-            self._prior = gtsam.NonlinearFactorGraph()
-            for factor in prior_factors(self._memory.known.marginal(self._shared)):
-                self._prior.add(factor)
+            self._prior = prior_factors(self._memory.known.marginal(self._shared))
         return self._prior
 
     def _solved(self, graph: gtsam.NonlinearFactorGraph, most: int) -> Generator[None, None, None]:

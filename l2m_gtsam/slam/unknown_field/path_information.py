@@ -78,28 +78,8 @@ class PathInformation:
         return self.odometry.variance_along(directions) - float(along @ along)
 
 
-def path_information(
-    drive: Drive,
-    poses: list[gtsam.Pose3],
-    values: gtsam.Values,
-    prior: WholePrior,
-    noise: SensorNoise,
-    weights: FloatArray,
-) -> PathInformation:
-    """Return what readings determine of a path.
-
-    Parameters
-    ----------
-    drive
-        K key poses of one sensor, with its calibration at the estimate and the prior's covariance.
-    poses, values
-        The estimates, and with them those of odometry's steady drift or scale.
-    prior, noise
-        Of the field and of the readings.
-    weights
-        Robust weight of each reading, positive, shape (N,).
-    """
-    near = PathNeighbourhood(drive, poses, values, prior, noise, weights)
+def path_information(near: "PathNeighbourhood") -> PathInformation:
+    """Return what readings determine of a path."""
     return PathInformation(near.odometry, *near.moved_by(determined(near)))
 
 
@@ -125,9 +105,19 @@ def determined(near: "PathNeighbourhood", count: int = VECTORS) -> FloatArray:
 class PathNeighbourhood:
     """The density of readings where odometry and sensor have other errors than estimated.
 
-    Parameters as of ``path_information``. Errors are those of odometry's steps, start and what they
-    have in common, then those of the sensor, all in units of their sigmas and relative to the
-    estimate.
+    Errors are those of odometry's steps, start and what they have in common, then those of the
+    sensor, all in units of their sigmas and relative to the estimate.
+
+    Parameters
+    ----------
+    drive
+        K key poses of one sensor, with its calibration at the estimate and the prior's covariance.
+    poses, values
+        The estimates, and with them those of odometry's steady drift or scale.
+    prior, noise
+        Of the field and of the readings.
+    weights
+        Robust weight of each reading, positive, shape (N,).
     """
 
     def __init__(

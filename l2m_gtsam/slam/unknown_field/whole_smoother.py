@@ -22,7 +22,7 @@ from l2m_gtsam.slam.pose_graph import drive_graph, drive_values
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import colamd_ordering
 from l2m_gtsam.slam.unknown_field.gain import gain_of
-from l2m_gtsam.slam.unknown_field.path_information import path_information
+from l2m_gtsam.slam.unknown_field.path_information import PathNeighbourhood, path_information
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.smoothed_drive import (
     FOLLOWED,
@@ -135,7 +135,9 @@ def with_information(
     """
     solution = found.solution
     drive, weights = solution.drive, np.maximum(solution.weights, REJECTED_WEIGHT)
-    information = path_information(drive, solution.poses, values, prior, noise, weights)
+    information = path_information(
+        PathNeighbourhood(drive, solution.poses, values, prior, noise, weights)
+    )
     jumps = [information.step_covariance(each.step) for each in drive.jumps]
     solution = replace(
         solution,

@@ -59,9 +59,6 @@ class AblationStudy(Study[AblationOptions, AblationCell, AblationTable]):
     name = "ablation"
     title = "What map, density and weights do"
     size = frozenset({"batches"})
-    options = AblationOptions
-    cell = AblationCell
-    summary = AblationTable
 
     def keys(self, options: AblationOptions) -> tuple[str, ...]:
         """Return a picture and batches for each map: kind, number of the density, which cell."""

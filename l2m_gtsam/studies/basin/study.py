@@ -16,7 +16,7 @@ from l2m_gtsam.studies.basin.cells import (
     cells_of,
 )
 from l2m_gtsam.studies.site import Site, mapped_site
-from l2m_gtsam.studies.statistics import Share
+from l2m_gtsam.studies.statistics import Share, in_percent
 from l2m_gtsam.studies.study import Study
 
 # Blue, green and vermilion differ for all kinds of colour vision.
@@ -33,9 +33,6 @@ class BasinStudy(Study[BasinOptions, DistortionCells, BasinTable]):
     name = "basin"
     title = "How far off may a guess be?"
     size = frozenset({"distortions"})
-    options = BasinOptions
-    cell = DistortionCells
-    summary = BasinTable
 
     def keys(self, options: BasinOptions) -> tuple[str, ...]:
         """Return one cell for each distortion."""
@@ -81,10 +78,7 @@ def trials(shares: Sequence[Share]) -> str:
 
 def draw_rates(axes: Axes, offset: FloatArray, shares: Sequence[Share], **style: Any) -> None:
     """Draw rates in per cent, with their intervals, at offsets in metres, shape (N,)."""
-    rate = 100 * np.array([share.rate for share in shares])
-    low, high = 100 * np.array([share.interval for share in shares]).T
-    # Rounding may put the end of an interval a hair on the wrong side of the rate.
-    reach = np.maximum([rate - low, high - rate], 0.0)
+    rate, reach = in_percent([each.rate for each in shares], [each.interval for each in shares])
     axes.errorbar(offset, rate, reach, capsize=2.5, linewidth=1.3, **style)
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from l2m_gtsam.studies.changes.cells import NEAR_M, ChangesCell, TrueChange, cell_of, unchanged_cell
 from l2m_gtsam.studies.changes.loads import ChangesStudyOptions, LoadedHall, loaded_hall
-from l2m_gtsam.studies.statistics import Share
+from l2m_gtsam.studies.statistics import Share, in_percent
 from l2m_gtsam.studies.study import Study
 
 # Edges of the classes that changes are counted in.
@@ -82,9 +82,6 @@ class ChangesStudy(Study[ChangesStudyOptions, ChangesCell, ChangesSummary]):
     name = "changes"
     title = "Places that change"
     size = frozenset({"halls", "unchanged"})
-    options = ChangesStudyOptions
-    cell = ChangesCell
-    summary = ChangesSummary
 
     def keys(self, options: ChangesStudyOptions) -> tuple[str, ...]:
         """Return the paths, hall by hall, then further ones without changes."""
@@ -155,9 +152,7 @@ class ChangesStudy(Study[ChangesStudyOptions, ChangesCell, ChangesSummary]):
         axes, at = figure.subplots(), np.arange(len(STRENGTHS) - 1)
         known = [k for k, each in enumerate(summary.by_strength) if each is not None]
         shares = [each.share for each in summary.by_strength if each is not None]
-        rate = np.array([100 * each.rate for each in shares])
-        ends = 100 * np.array([each.interval for each in shares]).reshape(-1, 2).T
-        reach = np.maximum([rate - ends[0], ends[1] - rate], 0.0)
+        rate, reach = in_percent([each.rate for each in shares], [each.interval for each in shares])
         axes.errorbar(at[known], rate, yerr=reach, fmt="o-", capsize=3, color="#0072b2")
         axes.set_xticks(at, [interval(*each) for each in pairs(STRENGTHS)])
         axes.set_xlabel("strongest field of the change at a reading (µT)")

@@ -24,7 +24,7 @@ from l2m_gtsam.studies.honesty.summary import (
     honesty_summary,
     settings,
 )
-from l2m_gtsam.studies.statistics import LEVEL
+from l2m_gtsam.studies.statistics import LEVEL, in_percent
 from l2m_gtsam.studies.study import Study
 
 UNITS = {
@@ -52,9 +52,6 @@ class HonestyStudy(Study[HonestyOptions, HonestyCell, HonestySummary]):
     name = "honesty"
     title = "Are the stated errors true?"
     size = frozenset({"surveys", "noises", "troubled_noises"})
-    options = HonestyOptions
-    cell = HonestyCell
-    summary = HonestySummary
 
     def keys(self, options: HonestyOptions) -> tuple[str, ...]:
         """Return a cell for each noise, survey and condition, those of one survey together."""
@@ -182,11 +179,8 @@ def coverage_figure(verdicts: Sequence[ConsistencyVerdict]) -> Figure:
 def draw_coverage(axes: Axes, verdict: ConsistencyVerdict, at: FloatArray, number: int) -> None:
     """Draw shares with their intervals at places (N,), in the style of a number."""
     rows = verdict.parameters
-    share = 100 * np.array([row.covered for row in rows])
-    low = 100 * np.array([row.interval.low for row in rows])
-    high = 100 * np.array([row.interval.high for row in rows])
-    # Rounding may put the end of an interval a hair on the wrong side of the share.
-    reach = np.maximum([share - low, high - share], 0.0)
+    ends = [(row.interval.low, row.interval.high) for row in rows]
+    share, reach = in_percent([row.covered for row in rows], ends)
     axes.errorbar(
         at,
         share,

@@ -63,9 +63,6 @@ class ScalingStudy(Study[ScalingOptions, ScalingCell, ScalingTable]):
     name = "scaling"
     title = "How time grows"
     size = frozenset({"readings", "survey", "dense", "workers"})
-    options = ScalingOptions
-    cell = ScalingCell
-    summary = ScalingTable
 
     def keys(self, options: ScalingOptions) -> tuple[str, ...]:
         """Return a cell for each size of each quantity, workers last: quantity, task, size."""

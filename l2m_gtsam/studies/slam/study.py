@@ -27,6 +27,7 @@ from l2m_gtsam.studies.slam.recordings import (
     robot_run,
     ship_run,
 )
+from l2m_gtsam.studies.statistics import mean_of
 from l2m_gtsam.studies.study import Study
 
 Cell = TypeVar("Cell")
@@ -121,9 +122,6 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
     name = "slam"
     title = "SLAM in an unknown field"
     size = frozenset({"seeds", "recordings"})
-    options = SlamStudyOptions
-    cell = SlamCell
-    summary = SlamSummary
 
     def keys(self, options: SlamStudyOptions) -> tuple[str, ...]:
         """Return one cell for each recording, drift, form and seed."""
@@ -265,12 +263,6 @@ def figures_of(rows: list[MethodRow], before: list[MethodRow]) -> MethodFigures:
         peak_mib=max((each.peak_mib for each in rows if each.peak_mib is not None), default=None),
         unchanged=sum(each.unchanged for each in rows),
     )
-
-
-def mean_of(values: list[float | None]) -> float | None:
-    """Return the mean of what is stated; None of nothing."""
-    stated = [each for each in values if each is not None]
-    return float(np.mean(stated)) if stated else None
 
 
 SLAM = SlamStudy()

@@ -95,9 +95,6 @@ class SlamArrayStudy(Study[SlamArrayOptions, SlamArrayCell, SlamArraySummary]):
     name = "slam-array"
     title = "SLAM with several sensors, in a map and without one"
     size = frozenset({"seeds", "recordings"})
-    options = SlamArrayOptions
-    cell = SlamArrayCell
-    summary = SlamArraySummary
 
     def keys(self, options: SlamArrayOptions) -> tuple[str, ...]:
         """Return one cell for each recording, drift and seed."""

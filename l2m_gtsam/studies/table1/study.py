@@ -38,9 +38,6 @@ class Table1Study(Study[Table1Options, Table1Cell, Table1Summary]):
     name = "table1"
     title = "The paper's Table I"
     size = frozenset({"distortions"})
-    options = Table1Options
-    cell = Table1Cell
-    summary = Table1Summary
 
     def keys(self, options: Table1Options) -> tuple[str, ...]:
         """Return a cell for each drive: noise level, path, number."""

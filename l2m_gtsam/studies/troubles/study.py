@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import chi2, f
+from scipy.stats import f
 
 from l2m_gtsam.records.verdict import Level
-from l2m_gtsam.studies.statistics import LEVEL, Share
+from l2m_gtsam.studies.statistics import LEVEL, Share, ellipsoid_coverage, in_percent, mean_of
 from l2m_gtsam.studies.study import Study
 from l2m_gtsam.studies.troubles.cells import Checked, JudgedSensor, TroublesCell, cell_of
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
@@ -91,9 +91,6 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
     name = "troubles"
     title = "What a PASS is worth"
     size = frozenset({"surveys", "worlds"})
-    options = TroublesOptions
-    cell = TroublesCell
-    summary = TroublesSummary
 
     def keys(self, options: TroublesOptions) -> tuple[str, ...]:
         """Return a cell for each survey and condition, those of one map together."""
@@ -152,11 +149,9 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
         axes.set_yticks(at, names, fontsize=8)
         axes.set_xlabel("verdicts (%)")
         for shift, name, colour in ((0.13, "passed", "#009e73"), (-0.13, "held", "#0072b2")):
-            shares = [getattr(row, name) for row in summary.rows]
-            known = [k for k, share in enumerate(shares) if share is not None]
-            rate = np.array([100 * shares[k].rate for k in known])
-            ends = 100 * np.array([shares[k].interval for k in known]).reshape(-1, 2).T
-            reach = np.maximum([rate - ends[0], ends[1] - rate], 0.0)
+            known = [k for k, row in enumerate(summary.rows) if getattr(row, name) is not None]
+            shares = [getattr(summary.rows[k], name) for k in known]
+            rate, reach = in_percent([e.rate for e in shares], [e.interval for e in shares])
             label = "of those judged PASS" if name == "passed" else "of all"
             style = {"fmt": "o", "markersize": 4, "capsize": 2.5, "color": colour, "label": label}
             other.errorbar(rate, at[known] + shift, xerr=reach, **style)
@@ -201,8 +196,8 @@ def row_of(world: World, trouble: Trouble, found: list[JudgedSensor]) -> Trouble
         trouble=trouble,
         levels=(count(found, Level.PASS), count(found, Level.WARN), count(found, Level.FAIL)),
         determined=len(known),
-        nees_t=mean([each.distance_t for each in known]),
-        nees=mean([each.distance for each in known]),
+        nees_t=mean_of([each.distance_t for each in known]),
+        nees=mean_of([each.distance for each in known]),
         held=within([each.distance for each in known], DOF),
         passed_t=within([each.distance_t for each in passed], DOF_T),
         passed=within([each.distance for each in passed], DOF),
@@ -220,11 +215,6 @@ def count(found: list[JudgedSensor], level: Level) -> int:
     return sum(each.level == level.value for each in found)
 
 
-def mean(values: list[Any]) -> float | None:
-    """Return the mean, if there is one."""
-    return float(np.mean(values)) if values else None
-
-
 def rms(values: list[Any]) -> float | None:
     """Return the root of the mean square, if there is one."""
     return float(np.sqrt(np.mean(np.square(values)))) if values else None
@@ -234,8 +224,7 @@ def within(distances: list[Any], dof: int) -> Share | None:
     """Return how many squared distances lie within the ellipsoid of 95 %."""
     if not distances:
         return None
-    inside = int(np.count_nonzero(np.array(distances) <= chi2.ppf(LEVEL, dof)))
-    return Share(inside, len(distances))
+    return Share(int(ellipsoid_coverage(np.array(distances), dof).sum()), len(distances))
 
 
 def by_check(known: list[JudgedSensor], name: str, dof: int) -> Share | None:

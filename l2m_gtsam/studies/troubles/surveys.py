@@ -1,7 +1,6 @@
 """Surveys of a place by a suite that is, or is not, what its file says."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,29 +33,6 @@ from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 SENSORS = 2
 
 
-class Place(Protocol):
-    """A place of which everything is known."""
-
-    @property
-    def seed(self) -> int:
-        """That it comes from."""
-
-    def field(self, points: FloatArray, /) -> FloatArray:
-        """Return the field in the map frame at points (N, 3) in uT, shape (N, 3)."""
-
-    def floor(self, xy: FloatArray, /) -> FloatArray:
-        """Return the height of the floor at places (N, 2) in metres, shape (N,)."""
-
-    def cloud(self) -> FloatArray:
-        """Return what a LiDAR saw of the steel, shape (M, 3), metres."""
-
-    def survey_way(self, options: TroublesOptions, /) -> FloatArray:
-        """Return where the sensors of a survey read, a pass for each height, shape (N, 3)."""
-
-    def drive(self, options: TroublesOptions, seed: int, /) -> CalibrationDrive:
-        """Return a drive of two sensors without any trouble."""
-
-
 @dataclass(frozen=True)
 class Hall:
     """A hall of magnetised cuboids."""
@@ -65,15 +41,15 @@ class Hall:
     seed: int
 
     def field(self, points: FloatArray) -> FloatArray:
-        """Return the field, shape (N, 3)."""
+        """Return the field in the map frame at points (N, 3) in uT, shape (N, 3)."""
         return self.hall.world.field(points)
 
     def floor(self, xy: FloatArray) -> FloatArray:
-        """Return the height of the floor, shape (N,)."""
+        """Return the height of the floor at places (N, 2) in metres, shape (N,)."""
         return self.hall.floor.height(xy)
 
     def cloud(self) -> FloatArray:
-        """Return posts and racks."""
+        """Return what a LiDAR saw of posts and racks, shape (M, 3), metres."""
         return hall_cloud(self.hall, CloudVariant.ACCURATE, self.seed)
 
     def survey_way(self, options: TroublesOptions) -> FloatArray:
@@ -95,15 +71,15 @@ class Corridor:
     seed: int
 
     def field(self, points: FloatArray) -> FloatArray:
-        """Return the field, shape (N, 3)."""
+        """Return the field in the map frame at points (N, 3) in uT, shape (N, 3)."""
         return self.office.field(points)
 
     def floor(self, xy: FloatArray) -> FloatArray:
-        """Return the height of the floor, shape (N,)."""
+        """Return the height of the floor at places (N, 2) in metres, shape (N,)."""
         return self.office.height(xy)
 
     def cloud(self) -> FloatArray:
-        """Return door frames, lift doors, radiators and cable trays."""
+        """Return what a LiDAR saw of door frames, lift doors, radiators and cable trays."""
         return self.office.cloud()
 
     def survey_way(self, options: TroublesOptions) -> FloatArray:
@@ -114,6 +90,10 @@ class Corridor:
         """Return a drive to and fro."""
         span = (min(options.heights), max(options.heights))
         return office_drive(self.office, seed, span, options.noise, SENSORS, options.readings)
+
+
+Place = Hall | Corridor
+"""A place of which everything is known."""
 
 
 def place_of(world: World, seed: int) -> Place:

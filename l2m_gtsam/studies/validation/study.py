@@ -181,9 +181,6 @@ class ValidationStudy(Study[ValidationStudyOptions, ValidationCell, ValidationSu
     name = "validation"
     title = "Whether the place changed or the vehicle"
     size = frozenset({"halls"})
-    options = ValidationStudyOptions
-    cell = ValidationCell
-    summary = ValidationSummary
 
     def keys(self, options: ValidationStudyOptions) -> tuple[str, ...]:
         """Return the drives, hall by hall: cases first."""

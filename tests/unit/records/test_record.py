@@ -2,17 +2,17 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any
 
 import pytest
 
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.metrics import MapPicture
-from l2m_gtsam.records.record import Record
+from l2m_gtsam.records.record import Record, Shape
 from l2m_gtsam.storage.record_files import read_metrics, read_slam
 
 Rows = tuple[tuple[float, ...], ...]
@@ -20,12 +20,10 @@ Rows = tuple[tuple[float, ...], ...]
 
 @dataclass(frozen=True)
 class _Example(Record):
-    SHAPES: ClassVar[Mapping[str, str]] = {"a": "N 3", "b": "N", "c": "N+1", "d": "M M"}
-
-    a: Rows
-    b: tuple[float, ...]
-    c: tuple[float, ...]
-    d: Rows | None = None
+    a: Annotated[Rows, Shape("N 3")]
+    b: Annotated[tuple[float, ...], Shape("N")]
+    c: Annotated[tuple[float, ...], Shape("N+1")]
+    d: Annotated[Rows | None, Shape("M M")] = None
 
 
 def test_shapes_that_fit() -> None:

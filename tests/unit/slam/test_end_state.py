@@ -64,7 +64,9 @@ def test_pose_and_sensor_have_the_covariance_of_the_path(
     poses, K = last.poses, len(last.poses)
     drive = replace(smooth.drive, sensors=with_noise(last.sensors, smooth.noise))
     weights = np.maximum(last.weights, REJECTED_WEIGHT)
-    path = path_information(drive, poses, last.values, smooth.prior, smooth.noise, weights)
+    path = path_information(
+        PathNeighbourhood(drive, poses, last.values, smooth.prior, smooth.noise, weights)
+    )
     ends = path.learnt[[0, -1]].reshape(12, -1)
     joint = path.odometry.joint([X(0), X(K - 1)]) - ends @ ends.T
     relative = poses[0].between(poses[-1])

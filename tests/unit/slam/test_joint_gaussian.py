@@ -79,8 +79,7 @@ def solved(
     values, sizes = gtsam.Values(of.values), {**of.sizes, M(9): 2}
     values.insert(M(9), np.zeros(2))
     whole = gtsam.NonlinearFactorGraph(graph)
-    for factor in prior_factors(of):
-        whole.add(factor)
+    whole.push_back(prior_factors(of))
     for _ in range(3):  # to the last digit
         values = levenberg_marquardt(whole, values, colamd_ordering(whole), 50, 0.0).values
     covariance = joint_posterior(whole.linearize(values), list(sizes)).covariance
@@ -136,9 +135,7 @@ def test_the_prior_is_what_was_known() -> None:
     """Its error about any values has the gradient and, at the mean, the information it says."""
     rng = np.random.default_rng(8)
     of = known(rng, 0.01)
-    prior, count = gtsam.NonlinearFactorGraph(), len(of.covariance)
-    for factor in prior_factors(of):
-        prior.add(factor)
+    prior, count = prior_factors(of), len(of.covariance)
     away = 0.1 * rng.normal(size=count)
     at, side, order = retracted(of.values, of.sizes, away), 1e-5, ordered(list(of.sizes))
     assert prior.error(at) == pytest.approx(0.5 * away @ np.linalg.solve(of.covariance, away))

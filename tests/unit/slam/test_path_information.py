@@ -17,7 +17,11 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import drive_values, odometry_graph
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.path_density import PathDensity
-from l2m_gtsam.slam.unknown_field.path_information import path_information, path_readings
+from l2m_gtsam.slam.unknown_field.path_information import (
+    PathNeighbourhood,
+    path_information,
+    path_readings,
+)
 from l2m_gtsam.slam.unknown_field.sensor_noise import NS, NoiseInformation, SensorNoise
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
@@ -117,7 +121,9 @@ def dense(step: Step) -> FloatArray:
 
 def test_covariances_are_those_of_dense_second_derivatives(step: Step) -> None:
     ones = np.ones(len(step.drive.readings))
-    found = path_information(step.drive, step.poses, step.values, step.prior, NOISE, ones)
+    found = path_information(
+        PathNeighbourhood(step.drive, step.poses, step.values, step.prior, NOISE, ones)
+    )
     expected = dense(step)
     scale = np.sqrt(np.diag(expected))
     own = found.step_covariance(0) / np.outer(scale[:12], scale[:12])
@@ -133,7 +139,9 @@ def test_covariances_are_those_of_dense_second_derivatives(step: Step) -> None:
 
 def test_a_variance_along_a_direction_is_that_of_the_joint_covariance(step: Step) -> None:
     ones = np.ones(len(step.drive.readings))
-    found = path_information(step.drive, step.poses, step.values, step.prior, NOISE, ones)
+    found = path_information(
+        PathNeighbourhood(step.drive, step.poses, step.values, step.prior, NOISE, ones)
+    )
     d = np.random.default_rng(2).normal(size=12)
     along = found.variance_along({X(0): d[:6], X(1): d[6:]})
     assert along == pytest.approx(float(d @ found.step_covariance(0) @ d), rel=1e-6)
