@@ -233,7 +233,7 @@ def corrections_of(
         )
     topics = {name: reading.bag.regressors[name] for name in names}
     count = counter(f"reading numbers of {bag.name}", progress)
-    scalars = read_scalars(bag, topics, reading.bag.stamps, count)
+    scalars = read_scalars(bag, topics, reading.bag.stamps, count, reading.bag.columns)
     series = {each.name: each for each in scalars}
     return {
         sensor.sensor: _correction(sensor, [series[m.name] for m in sensor.moving], reading)

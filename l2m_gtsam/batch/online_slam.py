@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,9 @@ from l2m_gtsam.batch.slam import (
     REFINED_FILE,
     TRAJECTORY_FILE,
     SlamInput,
+    calibration_notes,
     check_not_replaced,
+    map_provenance,
     write_refined,
 )
 from l2m_gtsam.config import Config
@@ -80,6 +83,8 @@ class OnlineOutcome:
         The most memory of the process, recording and map included, in MiB.
     truth
         Comparison with true poses, if they are known.
+    notes
+        What to know of the calibration that was used, a sentence each.
     """
 
     trajectory: Trajectory
@@ -88,6 +93,7 @@ class OnlineOutcome:
     driven_s: float
     peak_mib: float
     truth: TruthRecord | None
+    notes: tuple[str, ...] = ()
 
     @property
     def times_real(self) -> float:
@@ -143,7 +149,9 @@ def slam_online(
     trajectory = logged_trajectory(run.lines)
     write_tum(out / TRAJECTORY_FILE, trajectory)
     if saved is None:
-        _write_map_so_far(begun.slam, recording, config, out, progress)
+        source = source_file(given.calibration)
+        of_map = map_provenance(recording, calibration, source, "map", config)
+        _write_map_so_far(begun.slam, of_map, config, out, progress)
     stamps = recording.trajectory.stamp_ns
     from_first = saved is None and not config.slam.start.is_given
     return OnlineOutcome(
@@ -155,6 +163,7 @@ def slam_online(
         None
         if truth is None
         else _compared(truth, trajectory, recording, config, from_first=from_first),
+        calibration_notes(given.calibration, calibration),
     )
 
 
@@ -287,7 +296,7 @@ def _write_calibration_so_far(
 
 
 def _write_map_so_far(
-    slam: OnlineSlam, recording: Recording, config: Config, out: Path, progress: Progress
+    slam: OnlineSlam, provenance: dict[str, Any], config: Config, out: Path, progress: Progress
 ) -> None:
     """Write the field that was found as a map, if there is enough of it."""
     if not isinstance(slam.estimator, Explorer | OneFieldExplorer):
@@ -297,11 +306,6 @@ def _write_map_so_far(
         return
     with reported("building the map", progress):
         field_map = build_map(points, field, config.mapping.model)
-    provenance = {
-        "bags": [vars(recording.source)],
-        "frame": "map",
-        "config": config.model_dump(mode="json", include={"bag", "slam", "mapping"}),
-    }
     write_map(out / MAP_FILE, field_map, provenance, None)
 
 

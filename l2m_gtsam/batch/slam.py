@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from l2m_gtsam.batch.drives import METRICS_FILE
 from l2m_gtsam.batch.files import SavedMap, check_outputs
@@ -12,7 +13,7 @@ from l2m_gtsam.batch.reports import REPORT_FILE, SLAM_FILE, write_slam_report
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow, scan_start
 from l2m_gtsam.batch.software import versions
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import LidarMap, Recording, RigidTransform
+from l2m_gtsam.data import LidarMap, Recording, RigidTransform, SourceFile
 from l2m_gtsam.errors import LidarError, MapError, OutputError
 from l2m_gtsam.geometry import compose
 from l2m_gtsam.lidar.loop_closures import find_loop_closures
@@ -236,10 +237,8 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
         found = _explored(recording, calibration, scanned.evidence, config, progress)
     else:
         found = _localised(recording, calibration, saved, scanned.evidence, config, progress)
-    judged = calibration_notes(given.calibration, calibration)
-    # Those of a calibration are its own; those of a list say what is assumed here.
-    assumed = () if calibration.versions else calibration.notes
-    notes = (*assumed, *scanned.notes, *judged, *found.result.notes)
+    used = calibration_notes(given.calibration, calibration)
+    notes = (*used, *scanned.notes, *found.result.notes)
     result = replace(found.result, map=map_source, calibration_source=calibration_source)
     found = replace(found, result=replace(result, notes=notes))
     options = config.model_dump(mode="json", include={"bag", "lidar", "slam", "qa"})
@@ -253,18 +252,56 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     with published(out, *names) as stage:
         _write(found, record, config, stage)
         if saved is None:
-            _write_map(found, config, stage, failed=bool(judged))
+            frame = found.result.trajectory.frame
+            of_map = map_provenance(recording, calibration, calibration_source, frame, config)
+            write_map(stage / MAP_FILE, found.field_map, of_map, None)
         identity = Identity(record_id(stage / SLAM_FILE), source_file(stage / SLAM_FILE))
         write_slam_report(stage / REPORT_FILE, record, config.qa, identity)
     return SlamOutcome(found.result, record, judgement.verdict)
 
 
 def calibration_notes(path: Path, calibration: CalibrationResult) -> tuple[str, ...]:
-    """Return that a calibration was judged FAIL, a sentence; none where it was not."""
+    """Return what whoever uses a calibration has to know of it, a sentence each."""
+    # Notes of a calibration are its own; those of a list say what is assumed here.
+    assumed = () if calibration.versions else calibration.notes
+    if not _has_failed(calibration):
+        return assumed
+    return (*assumed, f"{path}: the verdict on the calibration that is used here is FAIL")
+
+
+def map_provenance(
+    recording: Recording,
+    calibration: CalibrationResult,
+    source: SourceFile,
+    frame: str,
+    config: Config,
+) -> dict[str, Any]:
+    """Return where a map comes from that is made of the field that a drive met.
+
+    Parameters
+    ----------
+    recording
+        The drive.
+    calibration, source
+        With what its readings were used, and the file of it.
+    frame
+        Of the map.
+    config
+        With what options.
+    """
+    level = {"verdict": Level.FAIL.value} if _has_failed(calibration) else {}
+    return {
+        "bags": [vars(recording.source)],
+        "calibration": {**vars(source), **level},
+        "frame": frame,
+        "config": config.model_dump(mode="json", include={"bag", "slam", "mapping"}),
+        "version": version("l2m-gtsam"),
+    }
+
+
+def _has_failed(calibration: CalibrationResult) -> bool:
     judged = calibration.judgement
-    if judged is None or judged.level is not Level.FAIL:
-        return ()
-    return (f"{path}: the verdict on the calibration that is used here is FAIL",)
+    return judged is not None and judged.level is Level.FAIL
 
 
 def _localised(
@@ -331,17 +368,3 @@ def _write(found: _Found, record: LocalisationRecord, config: Config, out: Path)
         made = replace(result.calibration, bag=result.bag, map=result.map, options=record.options)
         write_refined(out, made)
     write_slam(out / SLAM_FILE, record)
-
-
-def _write_map(found: _Found, config: Config, out: Path, *, failed: bool) -> None:
-    """Write the field that a drive met as a map: its poses are those that were found."""
-    result, used = found.result, found.result.calibration_source
-    level = {"verdict": Level.FAIL.value} if failed else {}
-    provenance = {
-        "bags": [vars(found.recording.source)],
-        "calibration": None if used is None else {**vars(used), **level},
-        "frame": result.trajectory.frame,
-        "config": config.model_dump(mode="json", include={"bag", "slam", "mapping"}),
-        "version": version("l2m-gtsam"),
-    }
-    write_map(out / MAP_FILE, found.field_map, provenance, None)

@@ -14,6 +14,8 @@ from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.storage.bounded import ArrayMember, open_archive, opened_array
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.point_table import (
+    ACCEPTED,
+    MISSING,
     PIECE_POINTS,
     pcd_pieces,
     ply_pieces,
@@ -112,8 +114,6 @@ class VoxelMeans:
 
 NPZ_MEMBER = "points.npy"
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-ACCEPTED = "a .pcd, .ply, .las, .laz, .e57 or .npz file (of the array `points`, shape (N, 3))"
-MISSING = f"no such point cloud; accepted: {ACCEPTED}"
 # Held at once: 120 MB, and a few times as much while they are merged.
 MAX_CELLS = 5_000_000
 MAX_KEPT_POINTS = 20_000_000  # of a cloud that is not thinned: 480 MB, twice for a moment

@@ -23,7 +23,8 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.storage.bounded import opened
 
 MAX_POINTS = 50_000_000
-MISSING = "no such point cloud; accepted: a .pcd, .ply or .npz file"
+ACCEPTED = "a .pcd, .ply, .las, .laz, .e57 or .npz file (of the array `points`, shape (N, 3))"
+MISSING = f"no such point cloud; accepted: {ACCEPTED}"
 MAX_HEADER_BYTES = 1 << 16
 MAX_LINE_BYTES = 1 << 13
 PIECE_POINTS = 1 << 18

@@ -10,7 +10,7 @@ import numpy as np
 from l2m_gtsam.data import ScalarSeries
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
-from l2m_gtsam.storage.bag_options import RegressorTopic, Stamps
+from l2m_gtsam.storage.bag_options import ColumnOptions, RegressorTopic, Stamps
 from l2m_gtsam.storage.field_types import Step, number_at, steps_of
 from l2m_gtsam.storage.log import Log, Message
 from l2m_gtsam.storage.open_log import open_log
@@ -33,6 +33,7 @@ def read_scalars(
     options: Mapping[str, RegressorTopic],
     stamps: Stamps = Stamps.HEADER,
     progress: Count | None = None,
+    columns: ColumnOptions | None = None,
 ) -> tuple[ScalarSeries, ...]:
     """Read the numbers that options name, in one pass; other topics are not decoded.
 
@@ -49,6 +50,8 @@ def read_scalars(
         Which time of a message counts, as for the readings.
     progress
         Called with the messages read and their number.
+    columns
+        Which columns of a CSV file are what, where their names do not say it.
 
     Raises
     ------
@@ -58,7 +61,7 @@ def read_scalars(
     if not options:
         return ()
     collected = [_NumberBuffer(name, each, steps_of(each.field)) for name, each in options.items()]
-    with open_log(path) as bag:
+    with open_log(path, columns) as bag:
         topics = {_topic(bag, each) for each in collected}
         connections = [c for c in bag.connections if c.topic.lstrip("/") in topics]
         for message in bag.messages(connections, progress):

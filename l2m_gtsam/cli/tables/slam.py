@@ -83,7 +83,7 @@ def gain_lines(gain: Gain | None) -> tuple[str, ...]:
 
 
 def online_lines(done: OnlineOutcome) -> tuple[str, ...]:
-    """Return what came of a drive on line: key poses, time, memory, and the last events."""
+    """Return what came of a drive on line: notes, the last events, key poses, time and memory."""
     cost = 1e3 * done.cost_s
     events = [
         f"{1e-9 * each.stamp_ns:.3f} {each.event[0]}: {each.event[1]}"
@@ -93,14 +93,15 @@ def online_lines(done: OnlineOutcome) -> tuple[str, ...]:
     more = len(events) - MOST_EVENTS
     left = (f"... and {more} more events before them, in online.jsonl",) if more > 0 else ()
     if not len(cost):
-        return (*left, *events[-MOST_EVENTS:], "no key pose has a place: the start was not found")
+        nowhere = "no key pose has a place: the start was not found"
+        return (*done.notes, *left, *events[-MOST_EVENTS:], nowhere)
     summary = (
         f"{len(done.trajectory)} key poses on line, {done.times_real:.1f} times real time; "
         f"processor ms per key pose: {np.median(cost):.1f} in the middle, "
         f"{np.quantile(cost, 0.99):.1f} at the 99th percentile, {cost.max():.0f} at most; at most "
         f"{done.peak_mib:.0f} MiB"
     )
-    return (*left, *events[-MOST_EVENTS:], summary)
+    return (*done.notes, *left, *events[-MOST_EVENTS:], summary)
 
 
 def truth_lines(truth: TruthRecord | None) -> tuple[str, ...]:
