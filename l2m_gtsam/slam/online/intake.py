@@ -7,10 +7,12 @@ and reported. What waits is bounded: of a parked vehicle every other pose and re
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Trajectory
+from l2m_gtsam.errors import InputError
 from l2m_gtsam.geometry import between
 from l2m_gtsam.recording.sync import at_poses, has_pose, interpolated, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
@@ -27,8 +29,7 @@ from l2m_gtsam.slam.options import SlamOptions, StepAxes
 
 MOST_SCANS = 8
 MOST_POSES = 512  # that wait for a key pose
-FAR_AHEAD_S = 10.0  # a pose further ahead of the last counts when the next one is later still
-AHEAD_S = 5.0  # a reading further ahead of odometry has a wrong stamp
+AHEAD_S = 5.0  # a reading or a scan further ahead of odometry has a wrong stamp
 NS = 1e-9
 SENSOR_TEXTS = {
     EventKind.OUT_OF_ORDER: "has readings that are older than those before them: they are left out",
@@ -96,7 +97,9 @@ class Intake:
         self._looked_at = 1
         self._strangers = set[str]()
         self._scans: list[Scan] = []
-        self._ahead: OdometryPose | None = None
+        self._held: OdometryPose | None = None  # ahead of the last, or older: the next one decides
+        self._velocities = self.state.velocity, self.state.last_velocity  # before the last pose
+        self._ahead = set[str]()  # sensors that were reported to be ahead of odometry
         self._events: list[OnlineEvent] = []
 
     def events(self) -> list[OnlineEvent]:
@@ -107,10 +110,19 @@ class Intake:
     def resume(self, state: IntakeState) -> None:
         """Go on from a state."""
         self.state, self._looked_at = state, 1
+        self._velocities = state.velocity, state.last_velocity
 
     def add_scan(self, scan: Scan) -> None:
         """Take a scan; the first pose that is no earlier becomes a key pose."""
         poses = self.state.poses
+        if poses:
+            latest = poses[-1].stamp_ns + AHEAD_S / NS
+            self._scans = [each for each in self._scans if each.stamp_ns <= latest]
+            if scan.stamp_ns > latest:
+                ahead = NS * (scan.stamp_ns - poses[-1].stamp_ns)
+                text = f"a scan is stamped {ahead:.1f} s ahead of odometry: left out"
+                self._report(scan.stamp_ns, EventKind.SCAN_REFUSED, text)
+                return
         late = self.state.number and scan.stamp_ns <= poses[0].stamp_ns
         if late or len(self._scans) == MOST_SCANS:
             text = "a scan comes later than its key pose, or too many wait for odometry: left out"
@@ -119,35 +131,75 @@ class Intake:
         self._scans.append(scan)
 
     def add_odometry(self, pose: OdometryPose) -> None:
-        """Take a pose; one that is no pose, or not later than the last, is refused."""
-        state, poses = self.state, self.state.poses
+        """Take a pose; one that is no pose, or not later than the last, is refused.
+
+        A pose after a gap, or older than the last, waits for the next one: if that is older than
+        the last, too, it is the last whose stamp is wrong.
+
+        Raises
+        ------
+        InputError
+            The stamp is no number of nanoseconds, or an array has another shape.
+        """
+        require_stamp(pose.stamp_ns)
+        pose.require_shapes()
         if not pose.is_rigid:
             text = "a pose of odometry is not finite, or its rotation is none: left out"
             self._report(pose.stamp_ns, EventKind.UNUSABLE, text)
             return
-        if poses and pose.stamp_ns <= poses[-1].stamp_ns:
+        self._settle(pose.stamp_ns)
+        poses = self.state.poses
+        if poses and pose.stamp_ns == poses[-1].stamp_ns:
+            return  # sent twice
+        after_gap_ns = self._options.max_pose_gap_s / NS
+        if poses and not 0 < pose.stamp_ns - poses[-1].stamp_ns <= after_gap_ns:
+            self._held = pose.proper
+            return
+        self._append(pose.proper)
+
+    def _settle(self, next_ns: int) -> None:
+        """Decide by the time of the next pose whether one that is held counts."""
+        held, self._held = self._held, None
+        if held is None:
+            return
+        state, last_ns = self.state, self.state.poses[-1].stamp_ns
+        if held.stamp_ns > last_ns and next_ns > held.stamp_ns:
+            self._append(held)
+        elif held.stamp_ns > last_ns:
+            self._report_ahead(held.stamp_ns)
+        elif held.stamp_ns < next_ns < last_ns and self._may_take_back(held.stamp_ns):
+            self._take_back()
+            self._append(held)
+        else:
             if not state.disordered:
-                late = NS * (poses[-1].stamp_ns - pose.stamp_ns)
+                late = NS * (last_ns - held.stamp_ns)
                 text = f"a pose of odometry is {late:.3f} s older than the one before: left out"
-                self._report(pose.stamp_ns, EventKind.OUT_OF_ORDER, text)
+                self._report(held.stamp_ns, EventKind.OUT_OF_ORDER, text)
             state.disordered = True
-            return
-        ahead, self._ahead = self._ahead, None
-        if ahead is not None and pose.stamp_ns > ahead.stamp_ns:
-            self._append(ahead)
-        elif ahead is not None:
-            text = "a pose of odometry is stamped far ahead of those after it: left out"
-            self._report(pose.stamp_ns, EventKind.OUT_OF_ORDER, text)
-        elif poses and pose.stamp_ns > poses[-1].stamp_ns + FAR_AHEAD_S / NS:
-            self._ahead = pose  # a wrong stamp, or a long gap: the next pose decides
-            return
-        self._append(pose)
+
+    def _may_take_back(self, stamp_ns: int) -> bool:
+        """Return whether the last pose is no key pose yet, and another may stand in its place."""
+        poses = self.state.poses
+        if len(poses) == 1:
+            return self.state.number == 0
+        return stamp_ns > poses[-2].stamp_ns
+
+    def _take_back(self) -> None:
+        state = self.state
+        wrong = state.poses.pop()
+        state.suspect.pop(wrong.stamp_ns, None)
+        state.velocity, state.last_velocity = self._velocities
+        self._looked_at = max(min(self._looked_at, len(state.poses) - 1), 1)
+        self._report_ahead(wrong.stamp_ns)
+
+    def _report_ahead(self, stamp_ns: int) -> None:
+        text = "a pose of odometry is stamped ahead of those after it: left out"
+        self._report(stamp_ns, EventKind.OUT_OF_ORDER, text)
 
     def _append(self, pose: OdometryPose) -> None:
         state, poses = self.state, self.state.poses
         state.disordered = False
-        if pose.covariance is not None and not np.isfinite(pose.covariance).all():
-            pose = replace(pose, covariance=None)
+        self._velocities = state.velocity, state.last_velocity
         if poses:
             self._check_step(poses[-1], pose)
         poses.append(pose)
@@ -156,30 +208,49 @@ class Intake:
             self._looked_at = len(poses) - 1
 
     def add_reading(self, stamp_ns: int, sensor: str, value: FloatArray) -> None:
-        """Take a reading in uT; one that is not finite, late, or of another sensor is left out."""
+        """Take a reading in uT; one that is not finite, late, or of another sensor is left out.
+
+        Raises
+        ------
+        InputError
+            The stamp is no number of nanoseconds, or the reading is not of shape (3,).
+        """
+        require_stamp(stamp_ns)
         number = self._index.get(sensor)
         if number is None:
             self._meet_stranger(stamp_ns, sensor)
             return
-        if not np.isfinite(value).all():
+        own = np.array(value, dtype=np.float64)
+        if own.shape != (3,):
+            raise InputError(f"a reading of {sensor}: of shape {own.shape}; needed is (3,)")
+        if not np.isfinite(own).all():
             return
         poses, buffer = self.state.poses, self.state.sensors[number]
         if poses and stamp_ns > poses[-1].stamp_ns + AHEAD_S / NS:
-            ahead = NS * (stamp_ns - poses[-1].stamp_ns)
-            text = f"a reading of {sensor} is stamped {ahead:.1f} s ahead of odometry: left out"
-            self._report(stamp_ns, EventKind.OUT_OF_ORDER, text)
+            if sensor not in self._ahead:
+                ahead = NS * (stamp_ns - poses[-1].stamp_ns)
+                text = f"a reading of {sensor} is stamped {ahead:.1f} s ahead of odometry: left out"
+                self._report(stamp_ns, EventKind.OUT_OF_ORDER, text)
+            self._ahead.add(sensor)
             return
+        self._ahead.discard(sensor)
         if self.state.number and stamp_ns <= poses[0].stamp_ns:
             if not buffer.disordered:
                 text = f"{sensor} {SENSOR_TEXTS[EventKind.OUT_OF_ORDER]}"
                 self._report(stamp_ns, EventKind.OUT_OF_ORDER, text)
             buffer.disordered = True
             return
-        for kind in buffer.add(stamp_ns, np.asarray(value, dtype=np.float64)):
+        before_ns = buffer.last_ns
+        for kind in buffer.add(stamp_ns, own):
             self._report(stamp_ns, kind, f"{sensor} {SENSOR_TEXTS[kind]}")
+        if buffer.last_ns < before_ns:
+            text = f"a reading of {sensor} is stamped ahead of those after it: left out"
+            self._report(before_ns, EventKind.OUT_OF_ORDER, text)
 
     def key_poses(self, *, to_the_end: bool = False) -> Iterator[ArrivedKeyPose]:
         """Yield the key poses that can be made by now; at the end of a drive all of them."""
+        if to_the_end and self._held is not None:
+            self._settle(self._held.stamp_ns + 1)  # nothing contradicts it any more
         while (row := self._next_row(to_the_end)) is not None:
             yield self._made(row)
 
@@ -215,7 +286,9 @@ class Intake:
         if not poses:
             return None
         if state.number == 0:
-            return 0
+            return (
+                0 if at_end or len(poses) > 1 else None
+            )  # the next may say that its stamp is wrong
         delay = 0 if at_end else round(self._online.delay_s / NS)
         for row in range(self._looked_at, len(poses)):
             if self._is_key_pose(row):
@@ -326,6 +399,12 @@ class Intake:
 
     def _report(self, stamp_ns: int, kind: EventKind, text: str) -> None:
         self._events.append(OnlineEvent(stamp_ns, kind, text))
+
+
+def require_stamp(stamp_ns: object) -> None:
+    """Raise an InputError for a time that is no number of nanoseconds."""
+    if not isinstance(stamp_ns, Integral):
+        raise InputError(f"stamp_ns: {stamp_ns!r}; needed are nanoseconds as an integer")
 
 
 def scans_at(scans: Sequence[Scan], trajectory: Trajectory, row: int) -> tuple[ScanAtKeyPose, ...]:

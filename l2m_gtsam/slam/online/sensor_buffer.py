@@ -29,6 +29,8 @@ class SensorBuffer:
         How many readings in a row have had it.
     silent, stuck, disordered
         What was reported of it and has not ended.
+    held
+        A reading that is older than the last: the next one decides which of both has a wrong stamp.
     """
 
     stamp_ns: list[int] = field(default_factory=list)
@@ -39,13 +41,16 @@ class SensorBuffer:
     silent: bool = False
     stuck: bool = False
     disordered: bool = False
+    held: tuple[int, FloatArray] | None = None
 
     def add(self, stamp_ns: int, value: FloatArray) -> list[EventKind]:
         """Take a finite reading, and return what is to be reported of it."""
-        if stamp_ns <= self.last_ns:
-            first, self.disordered = not self.disordered, True
-            return [EventKind.OUT_OF_ORDER] if first else []
-        found = []
+        if stamp_ns == self.last_ns:
+            return []  # sent twice
+        found = self._settle(stamp_ns)
+        if stamp_ns < self.last_ns:
+            self.held = stamp_ns, value
+            return found
         repeated = bool(np.abs(value - self.last).max() < STUCK_UT)
         self.same = self.same + 1 if repeated else 1
         if (self.silent or self.stuck) and not repeated:
@@ -57,6 +62,27 @@ class SensorBuffer:
         if len(self.stamp_ns) > MOST_WAITING:
             del self.stamp_ns[1::2], self.values[1::2]
         return found
+
+    def _settle(self, next_ns: int) -> list[EventKind]:
+        """Decide by the time of the next reading whether one that is held counts."""
+        held, self.held = self.held, None
+        if held is None:
+            return []
+        waiting = self.stamp_ns and self.stamp_ns[-1] == self.last_ns
+        before_ns = self.stamp_ns[-2] if waiting and len(self.stamp_ns) > 1 else -1
+        if before_ns < held[0] < next_ns < self.last_ns:
+            self._take_back(*held)
+            return []
+        first, self.disordered = not self.disordered, True
+        return [EventKind.OUT_OF_ORDER] if first else []
+
+    def _take_back(self, held_ns: int, value: FloatArray) -> None:
+        """Put a held reading in the place of the last one."""
+        if self.stamp_ns and self.stamp_ns[-1] == self.last_ns:
+            del self.stamp_ns[-1], self.values[-1]
+        self.stamp_ns.append(held_ns)
+        self.values.append(value)
+        self.last_ns, self.last = held_ns, value
 
     def check(self, now_ns: int, silent_ns: int, *, moved: bool) -> list[EventKind]:
         """Return what is to be reported at a key pose; drop readings of a sensor that is stuck.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray, KnownSensor, RigidTransform
-from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.errors import ConfigError, InputError
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.follower import Follower
@@ -15,7 +15,7 @@ from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, key_poses_of
 from l2m_gtsam.slam.online.odometry_check import OdometryPose
 from l2m_gtsam.slam.online.replay import FieldReading, give, messages
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
-from l2m_gtsam.slam.online.session import OnlineSlam
+from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.storage.online_log import SavedState, read_state, write_state
@@ -179,6 +179,67 @@ def test_stamps_out_of_order_are_left_out(
     assert set(run.kinds) == {EventKind.OUT_OF_ORDER}
     assert any("ahead of odometry" in each.text for each in run.events)
     np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
+
+
+@pytest.mark.parametrize("ahead_s", [0.3, 2.0, 9.0])
+def test_a_pose_that_is_stamped_ahead_is_taken_back(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun, ahead_s: float
+) -> None:
+    given = list(messages(hall[1].recording))
+    at = next(n for n, each in enumerate(given) if n > 600 and isinstance(each, OdometryPose))
+    ahead = replace(given[at], stamp_ns=given[at].stamp_ns + round(1e9 * ahead_s))
+    run = driven(in_map(hall), [*given[:at], ahead, *given[at:]])
+    assert set(run.kinds) <= {EventKind.OUT_OF_ORDER, EventKind.ODOMETRY_JUMP}
+    assert run.kinds.count(EventKind.OUT_OF_ORDER) == 1
+    np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
+
+
+def test_a_first_message_of_another_year_is_taken_back(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
+) -> None:
+    given, late = list(messages(hall[1].recording)), 4_070_908_800_000_000_000
+    first = next(each for each in given if isinstance(each, OdometryPose))
+    reading = FieldReading(late, hall[0][0].sensor, np.ones(3))
+    run = driven(in_map(hall), [reading, replace(first, stamp_ns=late), *given])
+    assert run.kinds.count(EventKind.OUT_OF_ORDER) == 2
+    np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
+
+
+def test_odometry_of_single_precision_in_a_buffer_that_is_used_again(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
+) -> None:
+    """Rotations off by 1e-4, as products of float32 become: as without to a millimetre."""
+    slam, R, t, b = in_map(hall), np.eye(3), np.zeros(3), np.zeros(3)
+    poses = list[OnlinePose]()
+    for each in messages(hall[1].recording):
+        if isinstance(each, OdometryPose):
+            R[:], t[:] = (1 + 1e-4) * each.T.R, each.T.t
+            poses += slam.add_odometry(replace(each, T=RigidTransform(R, t)))
+        else:
+            b[:] = each.field
+            slam.add_reading(each.stamp_ns, each.sensor, b)
+    found = np.stack([each.T_map_lidar.t for each in poses])
+    np.testing.assert_allclose(found, plain.trajectory().p[: len(found)], atol=1e-3)
+    R = poses[-1].T_map_lidar.R
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)  # rounding of many compositions
+
+
+def test_what_is_no_message_is_refused_at_the_door(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    slam, name = in_map(hall), hall[0][0].sensor
+    still = RigidTransform(np.eye(3), np.zeros(3))
+    with pytest.raises(InputError, match=r"of shape \(2, 3\); needed is \(3,\)"):
+        slam.add_reading(1, name, np.zeros((2, 3)))
+    with pytest.raises(InputError, match="needed are nanoseconds as an integer"):
+        slam.add_reading(1.5, name, np.zeros(3))  # type: ignore[arg-type]
+    for pose, told in (
+        (OdometryPose(1, np.eye(4)), "T is a ndarray; needed is a RigidTransform"),  # type: ignore[arg-type]
+        (OdometryPose(1, still, np.zeros(6)), r"covariance is \(6,\)"),
+        (OdometryPose(1, RigidTransform(np.eye(3), np.zeros((3, 1)))), r"T.t is \(3, 1\)"),
+    ):
+        with pytest.raises(InputError, match=told):
+            slam.add_odometry(pose)
 
 
 def test_a_slip_is_reported_and_what_is_no_pose_is_refused(
