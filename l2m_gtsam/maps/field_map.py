@@ -118,7 +118,8 @@ class FieldMap(Protocol):
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, also outside of the map.
 
         Never NaN: away from data the field returns to its mean, so that an optimiser may leave
-        the map in a trial step. ``gradient[n, i, j]`` = dB_i/dx_j.
+        the map in a trial step. ``gradient[n, i, j]`` = dB_i/dx_j. A harmonic map is constant
+        beyond the walls of its tiles, and keeps the gradient of the wall there, which leads back.
 
         Raises
         ------

@@ -33,6 +33,7 @@ ENOUGH = 0.02  # of a logarithm of likelihood: less than that in an update is no
 LARGEST = 1e6  # of the size of a process that says as much as a single reading
 ROUNDS = 3  # of sizes and noise; they settle in two
 LEAST_NOISE = 0.05  # of its variance
+ROUNDING = 1e-13  # of the largest information: what has less is a zero that was summed
 NEGLIGIBLE = 1e-3  # of a single weight's information: what a process says that is nothing
 
 
@@ -194,7 +195,8 @@ class WeightSystem:
         alone = np.diag(self.information)
         expected = spectra @ alone
         count = np.count_nonzero(spectra, axis=1)
-        sizes = np.where(expected > 0, count / np.where(expected > 0, expected, 1.0), 0.0)
+        shows = expected > ROUNDING * spectra.sum(axis=1) * alone.max(initial=0.0)
+        sizes = np.where(shows, count / np.where(shows, expected, 1.0), 0.0)
         last = -np.inf
         for _ in range(MOST_UPDATES):
             variances = sizes @ spectra

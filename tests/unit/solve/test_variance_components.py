@@ -118,3 +118,18 @@ def test_no_information_gives_no_size() -> None:
     found = nothing.components(np.eye(3))
     assert not found.sizes.any()
     assert found.gain == 0
+
+
+@pytest.mark.parametrize("left_of_it", [1e-29, 2.9e-15, -1.1e-27])
+def test_a_process_of_which_only_rounding_is_left_is_not_there(left_of_it: float) -> None:
+    """As of a clock that no motion shows: its information is a zero that was summed."""
+    rng = np.random.default_rng(3)
+    Z, y = drawn(rng, np.full(WEIGHTS, 4.0))
+    clear = system(100 * Z, 100 * y)
+    information, pull = clear.information.copy(), clear.pull.copy()
+    information[-1] = information[:, -1] = 1e-12 * rng.standard_normal(WEIGHTS)
+    information[-1, -1] = pull[-1] = left_of_it
+    spectra = np.repeat(np.eye(2), [WEIGHTS - 1, 1], axis=1)
+    found = WeightSystem(information, pull).components(spectra)
+    assert found.sizes[0] > 0
+    assert found.sizes[1] == 0
