@@ -38,6 +38,7 @@ from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 
 MOST_WAITING = 2000  # key poses of a start search: of a vehicle that turns on the spot
+MOST_SILENT_M = 1.0  # path before the first readings of a start search: it adds drift alone
 LAST_KEY_POSES = 20  # over which it is counted how many readings the map explains,
 LEAST_READINGS = 40  # where these have so many
 WEAKLY_HELD = (
@@ -97,6 +98,17 @@ class StartSearchState:
     first: StartPose
     waiting: list[ArrivedKeyPose]
     window_m: float
+
+    @property
+    def path_m(self) -> float:
+        """Path of the key poses so far, metres."""
+        return sum(each.length_m for each in self.waiting)
+
+    def is_silent(self) -> bool:
+        """Return whether no sensor has sent for so long that the search begins anew."""
+        if any(len(each.readings) for each in self.waiting):
+            return False
+        return self.path_m > MOST_SILENT_M or len(self.waiting) > MOST_WAITING
 
 
 class OnlineSlam:
@@ -251,6 +263,9 @@ class OnlineSlam:
             return
         if self.search is not None:
             self.search.waiting.append(key_pose)
+            if self.search.is_silent():
+                self._begin_search(key_pose)
+                return
             yield from self._searched(self.search, at_end=False)
             return
         yield self._estimated(key_pose)
@@ -344,8 +359,7 @@ class OnlineSlam:
     def _searched(self, search: StartSearchState, *, at_end: bool) -> Iterator[OnlinePose]:
         """Search for the start if the path is long enough; yield all key poses if it is found."""
         waiting, options = search.waiting, self.options.start
-        path = sum(each.length_m for each in waiting)
-        full = path >= search.window_m or len(waiting) > MOST_WAITING
+        full = search.path_m >= search.window_m or len(waiting) > MOST_WAITING
         if len(waiting) < 2 or not (full or at_end):
             return
         drive = drive_of(waiting, search.first, self.sensors)

@@ -334,6 +334,36 @@ def test_a_start_is_searched_for_on_line() -> None:
     assert run.nees(drive.truth).mean() < 12
 
 
+@pytest.mark.parametrize("broken", ["silent", "not a number"])
+def test_a_search_for_the_start_begins_with_readings(broken: str) -> None:
+    """No sensor sends for 7 m, or none a number: longer than a window, which has none to match."""
+    world = strange_hall(0)
+    sensors, drive = lost_drive(world, 0)
+    options = searching(window_m=4.0)
+    slam = OnlineSlam(calibrated(sensors), options, surveyed(world))
+
+    def late(reading: FieldReading) -> FieldReading | None:
+        if seconds_of(drive.recording, reading.stamp_ns) > 12:
+            return reading
+        return None if broken == "silent" else replace(reading, field=np.full(3, np.nan))
+
+    run = driven(slam, with_readings(messages(drive.recording), late))
+    assert EventKind.START_FOUND in run.kinds
+    first = seconds_of(drive.recording, int(run.trajectory().stamp_ns[0]))
+    assert 9 < first < 12  # a metre before the first reading at most
+    assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.1
+    assert run.nees(drive.truth).mean() < 12
+
+
+def test_a_search_without_readings_ends_without_poses() -> None:
+    world = strange_hall(0)
+    sensors, drive = lost_drive(world, 0, seconds=20)
+    slam = OnlineSlam(calibrated(sensors), searching(window_m=4.0), surveyed(world))
+    run = driven(slam, with_readings(messages(drive.recording), lambda _: None))
+    assert run.poses == ()
+    assert "there are no readings" in run.texts(EventKind.START_OPEN)[-1]
+
+
 @pytest.mark.parametrize("has_map", [True, False])
 def test_refined_calibrations_are_handed_out_with_what_is_known_of_them_then(
     has_map: bool,
