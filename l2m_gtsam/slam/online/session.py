@@ -24,6 +24,7 @@ from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose, as_transform
 from l2m_gtsam.slam.held_calibration import with_calibration_use
 from l2m_gtsam.slam.localisation import is_determined, known_sensors, start_pose
+from l2m_gtsam.slam.online.arguments import refuse_unusable
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower
@@ -128,6 +129,8 @@ class OnlineSlam:
 
     Raises
     ------
+    InputError
+        The calibration, the options or the map is something else.
     CalibrationError
         No sensor is calibrated.
     ConfigError
@@ -141,6 +144,7 @@ class OnlineSlam:
         field_map: QueryableMap | None = None,
         matcher: ScanMatcher | LoopMatcher | None = None,
     ) -> None:
+        refuse_unusable(calibration, options, field_map)
         usable = tuple(each for each in calibration.sensors if is_determined(each))
         usable = tuple(each for each in usable if not each.moving)
         if not usable:
