@@ -151,7 +151,7 @@ class OnlineSlam:
             raise CalibrationError("no sensor has a calibration that can be used")
         self._one_field = field_map is None and matcher is None and len(usable) == 1
         refuse_offline_only(options, has_map=field_map is not None, one_field=self._one_field)
-        self.sensors = known_sensors(usable)
+        self.sensors = self.given_sensors = known_sensors(usable)
         self.options = with_calibration_use(options, self.sensors, one_field=self._one_field)
         self._map = None if field_map is None else for_solvers(field_map)
         self.matcher = matcher
@@ -243,6 +243,11 @@ class OnlineSlam:
         free, robust = self.options.calibration is CalibrationUse.REFINED, self.options.robust
         over_m = self.options.drift.over_m
         return Follower(start, self.sensors, self.known_map(), robust, over_m, free=free)
+
+    @property
+    def field_map(self) -> QueryableMap | None:
+        """The map in its form for solvers, if there is one."""
+        return self._map
 
     def known_map(self) -> QueryableMap:
         """Return the map.
@@ -381,8 +386,15 @@ class OnlineSlam:
             # Odometry's errors would blur more: begin anew from here, which bounds the memory, too.
             self._begin_search(waiting[-1])
 
-    def resume_report(self) -> None:
-        """Report that the drive was resumed."""
+    def unread_events(self) -> tuple[OnlineEvent, ...]:
+        """Return what the next call of ``events`` will return."""
+        found = self.events()
+        self._events = list(found)
+        return found
+
+    def resume_report(self, unread: Sequence[OnlineEvent] = ()) -> None:
+        """Report that the drive was resumed, after events that were not read before."""
+        self._events += unread
         self._report(EventKind.RESUMED, "goes on from a saved state")
 
     def report_scans_ignored(self, text: str) -> None:

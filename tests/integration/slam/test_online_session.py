@@ -316,6 +316,45 @@ def test_a_state_of_something_else_is_refused(
         read_state(tmp_path / "none.npz")
 
 
+def test_another_map_or_calibration_than_before_is_refused(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    """With the same names; states that were saved before these were kept are still read."""
+    sensors, drive = hall
+    slam = in_map(hall)
+    for message in list(messages(drive.recording))[:300]:
+        give(slam, message)
+    state, known = saved_state(slam), calibrated(sensors)
+    for other in (
+        calibrated(sensors, sigma=np.full(15, 1e-3), rng=np.random.default_rng(1)),
+        calibrated(sensors, sigma=np.full(15, 1e-4)),
+    ):
+        with pytest.raises(ConfigError, match="another calibration: give that one, or begin"):
+            resumed_slam(state, other, OPTIONS, WORLD)
+    for elsewhere in (dipole_world(7), None):
+        with pytest.raises(ConfigError, match="another map: give that one, or begin"):
+            resumed_slam(state, known, OPTIONS, elsewhere)
+    arrays = {k: v for k, v in state.arrays.items() if not k.startswith("given.")}
+    facts = {k: v for k, v in state.facts.items() if k != "events"}
+    resumed_slam(SavedState(arrays, facts), known, OPTIONS, dipole_world(7))
+
+
+def test_events_that_nobody_has_read_are_saved(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], tmp_path: Path
+) -> None:
+    slam = in_map(hall)
+    for message in list(messages(hall[1].recording))[:300]:
+        give(slam, message)
+    slam.add_reading(slam.stamp_ns, "unheard_of", np.ones(3))
+    write_state(tmp_path / "state.npz", saved_state(slam))
+    unread = slam.events()
+    assert [each.kind for each in unread] == [EventKind.UNUSABLE]
+    saved = read_state(tmp_path / "state.npz")
+    again = resumed_slam(saved, calibrated(hall[0]), OPTIONS, WORLD).events()
+    assert again[:-1] == unread
+    assert again[-1].kind is EventKind.RESUMED
+
+
 def test_a_start_is_searched_for_on_line() -> None:
     """Odometry in a frame of its own; killed while the search waits for path, and resumed."""
     world = strange_hall(0)
