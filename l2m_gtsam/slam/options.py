@@ -70,7 +70,7 @@ class TileOptions(Options):
     them."""
     learn_over_m: float = Field(default=20.0, gt=0)
     """Path length from the start over which strength and depth of the sources are learnt: over it
-    odometry has to be better than the field's detail."""
+    odometry has to be better than the field's detail. Path without readings does not count."""
     hyperparameters: Hyperparameters | None = None
     """Strength and depth, where they are known; not learnt then."""
 
@@ -103,8 +103,8 @@ class WholeFieldOptions(Options):
     """The same on line, where the drive so far is short: beside errors of the poses and an unknown
     field it does not determine as much, and poses follow what is wrong."""
     solve_after_m: float = Field(default=10.0, gt=0)
-    """On line, path length after which the drive is solved for the first time, and again whenever
-    it has grown by two fifths."""
+    """On line, path length with readings after which the drive is solved for the first time, and
+    again whenever it has grown by two fifths."""
 
 
 class CalibrationUse(StrEnum):

@@ -8,18 +8,22 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import l2m_gtsam
 from l2m_gtsam.api.results import JudgedCalibration
 from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.config import load_options
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
+from tests.drives.slam import calibrated
 from tests.support.computed_once import computed_once
 from tests.support.map_files import copy_map
-from tests.support.pages import blocks, run_page, words
+from tests.support.pages import blocks, run_page, run_python, words
 from tests.support.repository import REPOSITORY
+from tests.worlds.exact import dipole_world, random_sensors
 
 DOCS = REPOSITORY / "docs"
 PAGES = [REPOSITORY / "README.md", *sorted(DOCS.rglob("*.md"))]
@@ -186,3 +190,16 @@ def fits(parts: list[str], text: str) -> bool:
 def test_a_message_that_nobody_raises_is_noticed() -> None:
     said = said_by_the_program()
     assert not raised("the map of … is upside down", said)
+
+
+def test_the_example_of_a_vehicle_has_all_that_it_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """But for its files and messages."""
+    (block,) = [each for each in blocks(DOCS / "slam.md") if "OnlineSlam(" in each.text]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(l2m_gtsam, "load_map", lambda _: dipole_world(1))
+    monkeypatch.setattr(l2m_gtsam, "read_calibration", lambda _: calibrated(random_sensors(1, 2)))
+    message = {"stamp_ns": 10**18, "field_ut": np.ones(3), "R": np.eye(3), "t": np.zeros(3)}
+    run_python(block, message)
+    assert (tmp_path / "state.npz").is_file()

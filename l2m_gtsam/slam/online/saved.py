@@ -13,8 +13,14 @@ from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.drive import StartPose, as_pose
+from l2m_gtsam.slam.online.begun_with import (
+    is_same_calibration,
+    is_same_map,
+    packed_map,
+    packed_sensors,
+)
 from l2m_gtsam.slam.online.belief import Belief
-from l2m_gtsam.slam.online.events import EventKind
+from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower, LastBelief
 from l2m_gtsam.slam.online.intake import Intake, IntakeState
 from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep
@@ -49,7 +55,8 @@ from l2m_gtsam.storage.online_log import SavedState
 FOLLOWING, EXPLORING, ONE_FIELD = "following", "exploring", "one_field"
 SEARCHING, WAITING = "searching", "waiting"
 SENSORS = ("t", "distortion", "covariance")
-OTHER = "the saved state is of another calibration, map or configuration: begin without --resume"
+BEGIN = "begin without --resume"
+OTHER = f"the saved state is of another calibration, map or configuration: {BEGIN}"
 # What a file that was changed by hand may raise where arrays become objects.
 BROKEN = (KeyError, ValueError, IndexError, TypeError, RuntimeError, OverflowError)
 
@@ -58,6 +65,7 @@ def saved_state(slam: OnlineSlam) -> SavedState:
     """Return all that a localisation needs to go on; its open section is closed for it."""
     arrays = {
         **named("intake", _packed_intake(slam.intake.state)),
+        **named("given", _packed_given(slam)),
         "sensor.names": np.frombuffer("\n".join(slam.sensors.names).encode(), dtype=np.uint8),
         "base": np.array([slam.base, slam.stamp_ns], dtype=np.int64),
     }
@@ -88,6 +96,8 @@ def saved_state(slam: OnlineSlam) -> SavedState:
         arrays |= named("sensors", own)
     else:
         facts["stage"] = WAITING
+    unread = slam.unread_events()
+    facts["events"] = [[each.stamp_ns, each.kind.value, each.text] for each in unread]
     return SavedState(arrays, facts)
 
 
@@ -114,16 +124,39 @@ def resumed_slam(
     """
     slam = OnlineSlam(calibration, options, field_map, matcher)
     names = "\n".join(slam.sensors.names).encode()
-    if state.facts.get("options") != slam.options.model_dump(mode="json"):
-        raise ConfigError(OTHER)
     try:
         if state.arrays["sensor.names"].tobytes() != names:
             raise ConfigError(OTHER)
+        _refuse_other(slam, under("given", state.arrays))
+        if state.facts.get("options") != slam.options.model_dump(mode="json"):
+            raise ConfigError(OTHER)
         _resume(slam, state)
+        unread = _unpacked_events(state.facts)
     except BROKEN as error:
-        raise ConfigError("the saved state is damaged: begin without --resume") from error
-    slam.resume_report()
+        raise ConfigError(f"the saved state is damaged: {BEGIN}") from error
+    slam.resume_report(unread)
     return slam
+
+
+def _packed_given(slam: OnlineSlam) -> Arrays:
+    arrays = packed_sensors(slam.given_sensors)
+    return arrays if slam.field_map is None else arrays | packed_map(slam.field_map)
+
+
+def _refuse_other(slam: OnlineSlam, given: Arrays) -> None:
+    """Refuse another calibration or map than a state was begun with; older states do not say."""
+    if not given:
+        return
+    if not is_same_calibration(given, slam.given_sensors):
+        raise ConfigError(f"the saved state is of another calibration: give that one, or {BEGIN}")
+    if not is_same_map(given, slam.field_map):
+        raise ConfigError(f"the saved state is of another map: give that one, or {BEGIN}")
+
+
+def _unpacked_events(facts: dict[str, Any]) -> list[OnlineEvent]:
+    """Return the events of a state that nobody has read; older states have none."""
+    saved = facts.get("events", [])
+    return [OnlineEvent(int(at), EventKind(kind), str(text)) for at, kind, text in saved]
 
 
 def _resume(slam: OnlineSlam, state: SavedState) -> None:

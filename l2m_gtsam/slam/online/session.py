@@ -24,6 +24,7 @@ from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose, as_transform
 from l2m_gtsam.slam.held_calibration import with_calibration_use
 from l2m_gtsam.slam.localisation import is_determined, known_sensors, start_pose
+from l2m_gtsam.slam.online.arguments import refuse_unusable
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower
@@ -38,6 +39,7 @@ from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 
 MOST_WAITING = 2000  # key poses of a start search: of a vehicle that turns on the spot
+MOST_SILENT_M = 1.0  # path before the first readings of a start search: it adds drift alone
 LAST_KEY_POSES = 20  # over which it is counted how many readings the map explains,
 LEAST_READINGS = 40  # where these have so many
 WEAKLY_HELD = (
@@ -98,6 +100,17 @@ class StartSearchState:
     waiting: list[ArrivedKeyPose]
     window_m: float
 
+    @property
+    def path_m(self) -> float:
+        """Path of the key poses so far, metres."""
+        return sum(each.length_m for each in self.waiting)
+
+    def is_silent(self) -> bool:
+        """Return whether no sensor has sent for so long that the search begins anew."""
+        if any(len(each.readings) for each in self.waiting):
+            return False
+        return self.path_m > MOST_SILENT_M or len(self.waiting) > MOST_WAITING
+
 
 class OnlineSlam:
     """Localises a vehicle while it drives.
@@ -116,6 +129,8 @@ class OnlineSlam:
 
     Raises
     ------
+    InputError
+        The calibration, the options or the map is something else.
     CalibrationError
         No sensor is calibrated.
     ConfigError
@@ -129,13 +144,14 @@ class OnlineSlam:
         field_map: QueryableMap | None = None,
         matcher: ScanMatcher | LoopMatcher | None = None,
     ) -> None:
+        refuse_unusable(calibration, options, field_map)
         usable = tuple(each for each in calibration.sensors if is_determined(each))
         usable = tuple(each for each in usable if not each.moving)
         if not usable:
             raise CalibrationError("no sensor has a calibration that can be used")
         self._one_field = field_map is None and matcher is None and len(usable) == 1
         refuse_offline_only(options, has_map=field_map is not None, one_field=self._one_field)
-        self.sensors = known_sensors(usable)
+        self.sensors = self.given_sensors = known_sensors(usable)
         self.options = with_calibration_use(options, self.sensors, one_field=self._one_field)
         self._map = None if field_map is None else for_solvers(field_map)
         self.matcher = matcher
@@ -228,6 +244,11 @@ class OnlineSlam:
         over_m = self.options.drift.over_m
         return Follower(start, self.sensors, self.known_map(), robust, over_m, free=free)
 
+    @property
+    def field_map(self) -> QueryableMap | None:
+        """The map in its form for solvers, if there is one."""
+        return self._map
+
     def known_map(self) -> QueryableMap:
         """Return the map.
 
@@ -251,6 +272,9 @@ class OnlineSlam:
             return
         if self.search is not None:
             self.search.waiting.append(key_pose)
+            if self.search.is_silent():
+                self._begin_search(key_pose)
+                return
             yield from self._searched(self.search, at_end=False)
             return
         yield self._estimated(key_pose)
@@ -344,8 +368,7 @@ class OnlineSlam:
     def _searched(self, search: StartSearchState, *, at_end: bool) -> Iterator[OnlinePose]:
         """Search for the start if the path is long enough; yield all key poses if it is found."""
         waiting, options = search.waiting, self.options.start
-        path = sum(each.length_m for each in waiting)
-        full = path >= search.window_m or len(waiting) > MOST_WAITING
+        full = search.path_m >= search.window_m or len(waiting) > MOST_WAITING
         if len(waiting) < 2 or not (full or at_end):
             return
         drive = drive_of(waiting, search.first, self.sensors)
@@ -363,8 +386,15 @@ class OnlineSlam:
             # Odometry's errors would blur more: begin anew from here, which bounds the memory, too.
             self._begin_search(waiting[-1])
 
-    def resume_report(self) -> None:
-        """Report that the drive was resumed."""
+    def unread_events(self) -> tuple[OnlineEvent, ...]:
+        """Return what the next call of ``events`` will return."""
+        found = self.events()
+        self._events = list(found)
+        return found
+
+    def resume_report(self, unread: Sequence[OnlineEvent] = ()) -> None:
+        """Report that the drive was resumed, after events that were not read before."""
+        self._events += unread
         self._report(EventKind.RESUMED, "goes on from a saved state")
 
     def report_scans_ignored(self, text: str) -> None:

@@ -64,6 +64,15 @@ def search_result(
     return StartSearch(verdict, summary, margin, window.path_m, len(window), looked_at, candidates)
 
 
+def nothing_read(window: DriveWindow) -> StartSearch:
+    """Return the result of a search that has no readings to compare with the map."""
+    message = (
+        f"there are no readings over the first {window.path_m:.1f} m of the drive: begin the drive "
+        "where the sensors send, or give `slam.start.position` and `quaternion_xyzw`"
+    )
+    return StartSearch(StartVerdict.AMBIGUOUS, message, 0.0, window.path_m, 0, 0, ())
+
+
 def verdict_of(
     candidates: tuple[StartCandidate, ...], margin: float, options: StartSearchOptions
 ) -> tuple[StartVerdict, str]:
@@ -197,6 +206,8 @@ def search_window(
     window: DriveWindow, lattice: FieldLattice, field_map: QueryableMap, options: SlamOptions
 ) -> StartSearch:
     """Return the candidates of one window of a drive, with a verdict."""
+    if not len(window):
+        return nothing_read(window)
     search, known = options.start.search, start_prior(window, lattice, options)
     pattern = window.pattern(known.tilt)
     rises = pattern.origin[2] - window.p_odom_lidar[2] + known.height

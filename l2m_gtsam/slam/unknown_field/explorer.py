@@ -30,6 +30,7 @@ from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory
 from l2m_gtsam.slam.unknown_field.open_section import OpenSection
+from l2m_gtsam.slam.unknown_field.read_path import ReadPath
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, drive_prior
 
 GROUP, SECTION = 20, 100  # limits in key poses instead of metres, for a vehicle that turns
@@ -125,6 +126,7 @@ class Explorer:
         self._reckoned = dict[int, gtsam.Pose3]()  # where odometry has these
         self._work: Iterator[None] | None = None  # on the section, which is not finished
         self._path_m = self._solved_m = self._opened_m = 0.0
+        self._read = ReadPath()  # until the field is learnt
         self._first, self._solved = 0, -1
         self._past: list[MarginalizedPose] = []
         self._belief = self._prior()
@@ -152,7 +154,10 @@ class Explorer:
         """
         self._waiting.append(key_pose)
         self._dead_reckon(key_pose)
-        if self._section is None and self._path_m >= self._options.tiles.learn_over_m:
+        if self._section is None:
+            self._read.add(key_pose.length_m, len(key_pose.readings))
+        is_long = self._read.length_m >= self._options.tiles.learn_over_m
+        if self._section is None and self._read.is_enough and is_long:
             self._learn()
         elif self._section is not None:
             if self._work is None and self._is_due():
@@ -162,14 +167,14 @@ class Explorer:
         return self._belief
 
     def finish(self) -> Belief:
-        """Solve for the key poses that odometry alone has had so far.
+        """Solve for the key poses that odometry alone has had so far; with few readings it stays.
 
         Raises
         ------
         MapError
             There are too few readings to learn a prior of the field from.
         """
-        if self._section is None:
+        if self._section is None and self._read.is_enough:
             self._learn()
         self._complete()
         if self._section is not None and self._waiting:

@@ -23,6 +23,7 @@ import gtsam
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.training import FEWEST
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose, stacked
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
@@ -34,6 +35,7 @@ from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
     JumpDecision,
     step_of,
 )
+from l2m_gtsam.slam.unknown_field.read_path import ReadPath
 from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, SmoothedDrive, end_state, smoothed
 from l2m_gtsam.slam.unknown_field.whole_field import (
     COARSE,
@@ -125,6 +127,7 @@ class OneFieldExplorer:
         self._origin = as_pose(start.T_map_lidar)
         self._key_poses: list[ArrivedKeyPose] = []
         self._path_m, self._learnt_m = 0.0, 0.0
+        self._read = ReadPath()
         self._reckoned = DeadReckoning.at_start()
         self._now: FollowedField | None = None
         self._work: Iterator[FollowedField | None] | None = None
@@ -146,8 +149,7 @@ class OneFieldExplorer:
     def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior."""
         self._key_poses.append(key_pose)
-        if key_pose.number > 0:
-            self._path_m += key_pose.length_m
+        self._count_path(key_pose)
         if key_pose.recorded is not None:
             self._open.append(key_pose.number)
         self._dead_reckon(key_pose)
@@ -163,7 +165,7 @@ class OneFieldExplorer:
 
     def finish(self) -> Belief:
         """Return the posterior of the last key pose, with all work done that has begun."""
-        if self._now is None and self._work is None and len(self._key_poses) > 1:
+        if self._now is None and self._work is None and self._read.is_enough:
             self._work = self._learning(None)
         self._complete()
         if self._now is not None and not self._is_possible(self._now):
@@ -215,18 +217,23 @@ class OneFieldExplorer:
         """Return an explorer that goes on from a state; other parameters as of the class."""
         own = cls(start, sensors, options)
         for each in state.key_poses:
+            own._count_path(each)
             own._dead_reckon(each)
         own._decisions = {each.number: each for each in state.decisions}
         own._key_poses = list(state.key_poses)
         jumps = [each.number for each in state.key_poses if each.recorded is not None]
         own._open = [number for number in jumps if number not in own._decisions]
-        own._path_m = sum(each.length_m for each in state.key_poses[1:])
         own._learnt_m = state.learnt_m
         if state.prior is not None:
             own._work = own._following(state.prior, state.beginning)
             own._complete()
         own._news = []
         return own
+
+    def _count_path(self, key_pose: ArrivedKeyPose) -> None:
+        if key_pose.number > 0:
+            self._path_m += key_pose.length_m
+            self._read.add(key_pose.length_m, len(key_pose.readings))
 
     def _dead_reckon(self, key_pose: ArrivedKeyPose) -> None:
         if key_pose.number > 0:
@@ -261,13 +268,14 @@ class OneFieldExplorer:
 
     def _due(self, now: FollowedField | None) -> Iterator[FollowedField | None] | None:
         """Return work that is due, to be done in pieces."""
+        is_long = self._read.length_m >= self._options.whole_field.solve_after_m
+        if not (self._read.is_enough and is_long):
+            return None
         inside = now is not None and _is_inside(now)
         if inside and len(self._key_poses) > MOST:
             return None
         growth = GROWN if inside else LEFT
-        if self._path_m >= max(self._options.whole_field.solve_after_m, growth * self._learnt_m):
-            return self._learning(now)
-        return None
+        return self._learning(now) if self._path_m >= growth * self._learnt_m else None
 
     def _learning(self, now: FollowedField | None) -> Iterator[FollowedField | None]:
         """Solve the drive so far, and follow the rest, in pieces."""
@@ -276,7 +284,8 @@ class OneFieldExplorer:
         count = min([len(self._key_poses), *self._open])
         recorded = frozenset(each for each in self._recorded if each < count)
         drive = self._drive(count)
-        smooth = (yield from self._smoothing(drive)) if LEAST <= count <= MOST else None
+        solvable = LEAST <= count <= MOST and len(drive.readings) >= FEWEST
+        smooth = (yield from self._smoothing(drive)) if solvable else None
         if smooth is not None:
             poses = smooth.stage.last.poses
             relative = tuple(poses[0].between(pose) for pose in poses)

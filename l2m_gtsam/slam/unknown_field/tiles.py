@@ -25,6 +25,7 @@ from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
 from l2m_gtsam.slam.options import MOST_WAVES, TileOptions
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
+from l2m_gtsam.slam.unknown_field.read_path import path_with_readings
 
 # Widening of the waves' prior: steel is not spread evenly, and with the prior as learnt a stretch
 # with more of it was estimated too low, by 0.1-0.4 m with sigmas of 0.04 m. The bias falls with the
@@ -99,8 +100,11 @@ def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> 
 
 
 def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) -> FieldPrior:
-    """Learn the prior of the field from the first metres of a drive, at poses by odometry."""
-    path = drive.steps.path
+    """Learn the prior of the field from the first metres of a drive, at poses by odometry.
+
+    Path without readings does not count.
+    """
+    path = path_with_readings(drive)
     early = np.flatnonzero(path[drive.readings.key_pose] <= options.learn_over_m)
     readings = drive.readings[early]
     where = place_readings(readings, poses, drive.sensors)

@@ -377,6 +377,45 @@ def test_a_state_of_something_else_is_refused(
         read_state(tmp_path / "none.npz")
 
 
+def test_another_map_or_calibration_than_before_is_refused(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    """With the same names; states that were saved before these were kept are still read."""
+    sensors, drive = hall
+    slam = in_map(hall)
+    for message in list(messages(drive.recording))[:300]:
+        give(slam, message)
+    state, known = saved_state(slam), calibrated(sensors)
+    for other in (
+        calibrated(sensors, sigma=np.full(15, 1e-3), rng=np.random.default_rng(1)),
+        calibrated(sensors, sigma=np.full(15, 1e-4)),
+    ):
+        with pytest.raises(ConfigError, match="another calibration: give that one, or begin"):
+            resumed_slam(state, other, OPTIONS, WORLD)
+    for elsewhere in (dipole_world(7), None):
+        with pytest.raises(ConfigError, match="another map: give that one, or begin"):
+            resumed_slam(state, known, OPTIONS, elsewhere)
+    arrays = {k: v for k, v in state.arrays.items() if not k.startswith("given.")}
+    facts = {k: v for k, v in state.facts.items() if k != "events"}
+    resumed_slam(SavedState(arrays, facts), known, OPTIONS, dipole_world(7))
+
+
+def test_events_that_nobody_has_read_are_saved(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], tmp_path: Path
+) -> None:
+    slam = in_map(hall)
+    for message in list(messages(hall[1].recording))[:300]:
+        give(slam, message)
+    slam.add_reading(slam.stamp_ns, "unheard_of", np.ones(3))
+    write_state(tmp_path / "state.npz", saved_state(slam))
+    unread = slam.events()
+    assert [each.kind for each in unread] == [EventKind.UNUSABLE]
+    saved = read_state(tmp_path / "state.npz")
+    again = resumed_slam(saved, calibrated(hall[0]), OPTIONS, WORLD).events()
+    assert again[:-1] == unread
+    assert again[-1].kind is EventKind.RESUMED
+
+
 def test_a_start_is_searched_for_on_line() -> None:
     """Odometry in a frame of its own; killed while the search waits for path, and resumed."""
     world = strange_hall(0)
@@ -393,6 +432,36 @@ def test_a_start_is_searched_for_on_line() -> None:
     assert stamps[0] == drive.recording.trajectory.stamp_ns[0]
     assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.1
     assert run.nees(drive.truth).mean() < 12
+
+
+@pytest.mark.parametrize("broken", ["silent", "not a number"])
+def test_a_search_for_the_start_begins_with_readings(broken: str) -> None:
+    """No sensor sends for 7 m, or none a number: longer than a window, which has none to match."""
+    world = strange_hall(0)
+    sensors, drive = lost_drive(world, 0)
+    options = searching(window_m=4.0)
+    slam = OnlineSlam(calibrated(sensors), options, surveyed(world))
+
+    def late(reading: FieldReading) -> FieldReading | None:
+        if seconds_of(drive.recording, reading.stamp_ns) > 12:
+            return reading
+        return None if broken == "silent" else replace(reading, field=np.full(3, np.nan))
+
+    run = driven(slam, with_readings(messages(drive.recording), late))
+    assert EventKind.START_FOUND in run.kinds
+    first = seconds_of(drive.recording, int(run.trajectory().stamp_ns[0]))
+    assert 9 < first < 12  # a metre before the first reading at most
+    assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.1
+    assert run.nees(drive.truth).mean() < 12
+
+
+def test_a_search_without_readings_ends_without_poses() -> None:
+    world = strange_hall(0)
+    sensors, drive = lost_drive(world, 0, seconds=20)
+    slam = OnlineSlam(calibrated(sensors), searching(window_m=4.0), surveyed(world))
+    run = driven(slam, with_readings(messages(drive.recording), lambda _: None))
+    assert run.poses == ()
+    assert "there are no readings" in run.texts(EventKind.START_OPEN)[-1]
 
 
 @pytest.mark.parametrize("has_map", [True, False])

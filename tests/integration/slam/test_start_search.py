@@ -127,6 +127,30 @@ def test_a_door_that_was_opened_does_not_hide_the_place() -> None:
     assert found.candidates[0].explained < 1
 
 
+def silent_until(drive: SlamDrive, seconds: float) -> SlamDrive:
+    """Return a drive whose sensors begin to send after a time."""
+    first = drive.recording.trajectory.stamp_ns[0] + round(1e9 * seconds)
+    series = tuple(
+        replace(each, stamp_ns=each.stamp_ns[late], field=each.field[late])
+        for each in drive.recording.series
+        for late in [each.stamp_ns > first]
+    )
+    return replace(drive, recording=replace(drive.recording, series=series))
+
+
+def test_sensors_that_begin_late_are_searched_with_or_the_drive_is_refused() -> None:
+    """They are silent for 9 m: longer than the first window, or than the longest."""
+    world = strange_hall(0)
+    sensors, drive = lost_drive(world, 0, seconds=30)
+    late = silent_until(drive, 15.0)
+    found = searched((sensors, late), surveyed(world), window_m=4.0)
+    assert found.verdict is StartVerdict.UNIQUE
+    assert away(found, drive.truth.p[0])[0] < 0.5  # by odometry
+    options = searching(window_m=4.0, longest_m=8.0)
+    with pytest.raises(MapError, match=r"^there are no readings over the first [78]\.\d m of the"):
+        localise(late.recording, surveyed(world), calibrated(sensors), options, silent)
+
+
 def test_a_known_height_is_kept() -> None:
     world = strange_hall(9)
     lost = lost_drive(world, 9)
