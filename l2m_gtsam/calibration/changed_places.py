@@ -38,6 +38,7 @@ AXES = 3
 # Errors of a map over what it states, at held-out readings of its survey: with more of them its
 # model is not the place's. Up to this they count as large as they are.
 MOST_OVER_STATED = 3.0
+SINGULAR = 1e6  # condition of a C that is not to be inverted
 ROUNDS = 4  # of solving with sources and looking for them again
 SETTLED_SIGMAS = 0.3
 
@@ -143,11 +144,14 @@ def search(
     known
         Sources that were found before, which the solve knows of.
     """
-    if not options.sources.most or not isinstance(field_map, UncertainMap) or not solution.placed:
+    if not options.sources.most or not isinstance(field_map, UncertainMap):
         return None
-    if not is_place_of(field_map):
+    # A sensor with a dead axis does not say what the field is.
+    whole = np.linalg.cond(solution.estimate.C()) < SINGULAR
+    sensors = tuple(each for each in solution.placed if whole[each])
+    if not sensors or not is_place_of(field_map):
         return None
-    drive = averaged_drive(solution, solution.placed, field_map, options.averaging)
+    drive = averaged_drive(solution, sensors, field_map, options.averaging)
     places = suspected(drive, field_map, options.averaging)
     if not len(places) and known is None:
         return None

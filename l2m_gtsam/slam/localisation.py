@@ -128,7 +128,7 @@ def in_decoy(drive: Drive, decoy: QueryableMap, options: SlamOptions) -> DriveSo
     """Return a drive's solution in a decoy map; None where it has none, which says nothing."""
     try:
         return localise_drive(drive, decoy, options, silent)
-    except CalibrationError:
+    except (CalibrationError, np.linalg.LinAlgError):  # in a wrong field poses may go anywhere
         return None
 
 

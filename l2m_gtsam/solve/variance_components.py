@@ -177,9 +177,12 @@ class WeightSystem:
 
     def _factor(self, root: FloatArray) -> FloatArray:
         """Return the lower Cholesky factor of ``1 + S^1/2 I S^1/2``, in Fortran order, (m, m)."""
-        inner = root[:, None] * self.information * root
-        inner[np.diag_indices_from(inner)] += 1.0
-        return np.asarray(cholesky(inner.T, lower=True, overwrite_a=True, check_finite=False))
+        try:
+            return _factor_of(self.information, root)
+        except np.linalg.LinAlgError:
+            # A difference of informations that rounding made indefinite.
+            values, axes = np.linalg.eigh(self.information)
+            return _factor_of((axes * np.maximum(values, 0.0)) @ axes.T, root)
 
     def scores(self, spectra: FloatArray) -> FloatArray:
         """Return how far K processes of these spectra, (K, m), are from not being there, (K,).
@@ -197,7 +200,7 @@ class WeightSystem:
         count = np.count_nonzero(spectra, axis=1)
         shows = expected > ROUNDING * spectra.sum(axis=1) * alone.max(initial=0.0)
         sizes = np.where(shows, count / np.where(shows, expected, 1.0), 0.0)
-        last = -np.inf
+        most, last = LARGEST * sizes, -np.inf
         for _ in range(MOST_UPDATES):
             variances = sizes @ spectra
             found = self.fit(variances)
@@ -207,7 +210,7 @@ class WeightSystem:
             known = found.share / np.where(variances > 0, variances, 1.0)  # the diagonal of M
             informed = spectra @ known
             ratio = (spectra @ found.rest**2) / np.where(informed > 0, informed, 1.0)
-            sizes = sizes * np.sqrt(np.where(informed > 0, ratio, 0.0))
+            sizes = np.minimum(sizes * np.sqrt(np.where(informed > 0, ratio, 0.0)), most)
             sizes = np.where(sizes * expected > NEGLIGIBLE, sizes, 0.0)
         return VarianceComponents(sizes, 2 * self.fit(sizes @ spectra).likelihood)
 
@@ -238,6 +241,12 @@ class WeightSystem:
             explained = beyond.pull @ (variances * system.fit(variances).rest)
             noise = max(1 - float(explained) / squares, LEAST_NOISE)
         return found
+
+
+def _factor_of(information: FloatArray, root: FloatArray) -> FloatArray:
+    inner = root[:, None] * information * root
+    inner[np.diag_indices_from(inner)] += 1.0
+    return np.asarray(cholesky(inner.T, lower=True, overwrite_a=True, check_finite=False))
 
 
 def shared_components(

@@ -133,3 +133,17 @@ def test_a_process_of_which_only_rounding_is_left_is_not_there(left_of_it: float
     found = WeightSystem(information, pull).components(spectra)
     assert found.sizes[0] > 0
     assert found.sizes[1] == 0
+
+
+def test_information_that_rounding_made_indefinite_has_sizes_all_the_same() -> None:
+    """As of a difference of informations of which little is left: off by 1e-8 of the largest."""
+    rng = np.random.default_rng(4)
+    axes, _ = np.linalg.qr(rng.standard_normal((WEIGHTS, WEIGHTS)))
+    values = np.geomspace(1e-2, 1e6, WEIGHTS)
+    values[0] = -1e-2
+    information = (axes * values) @ axes.T
+    pull = information @ (1e3 * rng.standard_normal(WEIGHTS))
+    spectra = np.repeat(np.eye(2), [4, WEIGHTS - 4], axis=1)
+    found = WeightSystem(0.5 * (information + information.T), pull).components(spectra)
+    assert np.isfinite(found.sizes).all()
+    assert found.gain > 0
