@@ -63,13 +63,18 @@ class SensorVariables:
         if self._fixed is not None:
             return self._fixed
         known = Calibrations.zeros(max(sensors) + 1)
-        for sensor in sensors:
-            if values.exists(T(sensor)):
-                known.t[sensor] = values.atPoint3(T(sensor))
-                known.distortion[sensor] = values.atVector(D(sensor))
-                if self.timed:
-                    known.offset[sensor] = values.atDouble(S(sensor))
+        for sensor in self.known(values, sensors):
+            known.t[sensor] = values.atPoint3(T(sensor))
+            known.distortion[sensor] = values.atVector(D(sensor))
+            if self.timed:
+                known.offset[sensor] = values.atDouble(S(sensor))
         return known
+
+    def known(self, values: gtsam.Values, sensors: list[int]) -> list[int]:
+        """Return those of these sensors whose calibrations values have: on line, some come late."""
+        if self._fixed is not None:
+            return sensors
+        return [each for each in sensors if values.exists(T(each))]
 
     def C(self, values: gtsam.Values, rows: npt.NDArray[np.int64]) -> FloatArray:
         """Return the distortion matrix of each of n readings, shape (n, 3, 3)."""
@@ -149,6 +154,7 @@ class KeyPoseBatch(ABC):
         numbers, self._slot = np.unique(readings.key_pose, return_inverse=True)
         self._rows = {int(k): np.flatnonzero(self._slot == n) for n, k in enumerate(numbers)}
         self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}
+        self._every_sensor = self._variables.on(np.arange(len(readings)))
         self._seen: dict[int, bytes] = {}
         self._residuals: KeyPoseResiduals | None = None
 
@@ -171,9 +177,9 @@ class KeyPoseBatch(ABC):
         """
         stamp = self._stamp(values, key_pose)
         if self._residuals is None or self._seen.get(key_pose) != stamp:
-            present = [k for k in self._rows if self._is_present(values, k)]
+            present = self._present(values)
             self._residuals = self._evaluated(values, present)
-            self._seen = {k: self._stamp(values, k) for k in present}
+            self._seen = self._stamps(values, present)
         return self._residuals
 
     @abstractmethod
@@ -191,6 +197,15 @@ class KeyPoseBatch(ABC):
     @abstractmethod
     def _own_stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
         """Return what pose and field depend on as bytes, which compare faster than arrays."""
+
+    def _present(self, values: gtsam.Values) -> list[int]:
+        return [k for k in self._rows if self._is_present(values, k)]
+
+    def _stamps(self, values: gtsam.Values, present: list[int]) -> dict[int, bytes]:
+        """Return the stamps of those key poses whose sensors are all known."""
+        known = set(self._variables.known(values, self._every_sensor))
+        complete = (k for k in present if known.issuperset(self._sensors[k]))
+        return {k: self._stamp(values, k) for k in complete}
 
     def _stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
         of_sensors = self._variables.stamp(values, self._sensors[key_pose])
@@ -210,5 +225,5 @@ class KeyPoseBatch(ABC):
         for k in present:
             pose = self._pose(values, k)
             R[slots[k]], p[slots[k]] = pose.rotation().matrix(), pose.translation()
-        sensors = self._variables.calibrations(values, self._variables.on(np.arange(len(self))))
+        sensors = self._variables.calibrations(values, self._every_sensor)
         return R[self._slot], p[self._slot], sensors

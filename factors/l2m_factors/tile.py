@@ -158,9 +158,9 @@ class TileBatch(KeyPoseBatch):
             if self._seen.get(key_pose) == stamp:
                 point, self._placed = self._point, self._seen
             else:
-                present = [k for k in self._rows if self._is_present(values, k)]
+                present = self._present(values)
                 point = self._evaluation_point(values, present)
-                self._placed = {k: self._stamp(values, k) for k in present}
+                self._placed = self._stamps(values, present)
             self._places = self._places_at(*point)
         return self._places[self._rows[key_pose]]
 
@@ -215,7 +215,9 @@ class TileBatch(KeyPoseBatch):
         return values.atPose3(X(self._anchor)).between(values.atPose3(X(key_pose)))
 
     def _is_present(self, values: gtsam.Values, key_pose: int) -> bool:
-        return key_pose == self._anchor or bool(values.exists(X(key_pose)))
+        if key_pose == self._anchor:
+            return True
+        return bool(values.exists(X(self._anchor)) and values.exists(X(key_pose)))
 
     def _field(self, values: gtsam.Values) -> DifferentiableMap:
         return WeightedField(self._tile, values.atVector(M(self._number)))

@@ -125,9 +125,8 @@ class TileBlocks(TileBatch):
         super().__init__(number, anchor, field, readings, fixed)
         self._W = whitening
         self._on_anchor = self._rows.get(anchor, np.empty(0, dtype=np.int64))
-        every_sensor = self._variables.on(np.arange(len(readings)))
         poses = [X(k) for k in dict.fromkeys([*self._rows, anchor])]
-        self._every_key = [*poses, M(number), *self._variables.keys(every_sensor)]
+        self._every_key = [*poses, M(number), *self._variables.keys(self._every_sensor)]
         self._evaluated_at = gtsam.Values()
         self._found: KeyPoseResiduals
         self._white: FloatArray
@@ -204,8 +203,7 @@ class TileBlocks(TileBatch):
         at = self._own_values(values)
         if at.equals(self._evaluated_at, 0.0):
             return
-        present = [k for k in self._rows if self._is_present(values, k)]
-        self._found = self._evaluated(values, present)
+        self._found = self._evaluated(values, self._present(values))
         self._where = self._places_at(*self._point)
         self._white = np.einsum("nij,nj->ni", self._W, self._found.reading.residual)
         self._of_readings = self._of_places = None

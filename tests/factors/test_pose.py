@@ -189,6 +189,22 @@ def test_a_factor_alone_needs_only_its_own_variables() -> None:
     assert key_pose_factor(batch, 1, W).error(values) == pytest.approx(alone.error(everything))
 
 
+def test_a_sensor_that_comes_later_is_not_asked_for() -> None:
+    """On line, values have all key poses so far, but no calibration of a sensor yet to come."""
+    everything, readings = values_for(5), random_carried(5)
+    readings = replace(readings, sensor=readings.key_pose)
+    values = gtsam.Values()
+    for key in (X(0), X(1)):
+        values.insert(key, everything.atPose3(key))
+    values.insert(T(0), everything.atPoint3(T(0)))
+    values.insert(D(0), everything.atVector(D(0)))
+    world, W = dipole_world(5), whitenings(5, 4)
+    alone = key_pose_factor(MapBatch(world, on(readings, 0)), 0, W)
+    factor = key_pose_factor(MapBatch(world, readings), 0, W)
+    assert factor.error(values) == pytest.approx(alone.error(values))
+    assert_jacobians_match(factor, values)
+
+
 def test_a_reading_pulls_its_pose_back() -> None:
     """Exact readings of two sensors on one pose, calibration known: the pose comes back."""
     world, values = dipole_world(6), values_for(6, key_poses=1)

@@ -107,6 +107,16 @@ def test_at_the_anchor_readings_say_nothing_of_the_pose() -> None:
     assert batch.keys_of(0) == [X(0), X(1), M(TILE)]
 
 
+def test_a_factor_at_the_anchor_does_not_ask_for_its_pose() -> None:
+    """A graph may have another key pose of the tile, and no value of the anchor."""
+    readings, values = random_carried(3), tile_values(3)
+    at_anchor = tile_factor(batch_of(readings, 1, values), 1, whitenings(3, 4))
+    expected = at_anchor.error(values)
+    values.erase(X(1))
+    again = tile_factor(batch_of(readings, 1, values), 1, whitenings(3, 4))
+    assert again.error(values) == expected
+
+
 def test_a_batch_is_evaluated_again_only_when_its_variables_change() -> None:
     readings, values = random_carried(4), tile_values(4)
     batch = batch_of(readings, 0, values)
