@@ -2,6 +2,7 @@
 
 import struct
 from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -131,6 +132,21 @@ class SensorVariables:
         return [T(sensor), D(sensor), *([S(sensor)] if self.timed else [])]
 
 
+class Evaluation(NamedTuple):
+    """All residuals of a batch and the values they are of; stored at once, for several threads.
+
+    Attributes
+    ----------
+    seen
+        Of each key pose what its readings depend on, as bytes.
+    residuals
+        Of all readings.
+    """
+
+    seen: dict[int, bytes]
+    residuals: KeyPoseResiduals
+
+
 class KeyPoseBatch(ABC):
     """What batches of readings on key poses have in common.
 
@@ -155,8 +171,7 @@ class KeyPoseBatch(ABC):
         self._rows = {int(k): np.flatnonzero(self._slot == n) for n, k in enumerate(numbers)}
         self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}
         self._every_sensor = self._variables.on(np.arange(len(readings)))
-        self._seen: dict[int, bytes] = {}
-        self._residuals: KeyPoseResiduals | None = None
+        self._last: Evaluation | None = None
 
     def __len__(self) -> int:
         return len(self._readings)
@@ -175,12 +190,12 @@ class KeyPoseBatch(ABC):
 
         Those of key poses without values mean nothing, as when one factor is used alone.
         """
-        stamp = self._stamp(values, key_pose)
-        if self._residuals is None or self._seen.get(key_pose) != stamp:
+        stamp, last = self._stamp(values, key_pose), self._last
+        if last is None or last.seen.get(key_pose) != stamp:
             present = self._present(values)
-            self._residuals = self._evaluated(values, present)
-            self._seen = self._stamps(values, present)
-        return self._residuals
+            last = Evaluation(self._stamps(values, present), self._evaluated(values, present))
+            self._last = last
+        return last.residuals
 
     @abstractmethod
     def _pose(self, values: gtsam.Values, key_pose: int) -> gtsam.Pose3:

@@ -5,7 +5,7 @@ readings, made when the first factor of a linearisation asks and kept until a va
 """
 
 import struct
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import gtsam
 import numpy as np
@@ -16,6 +16,21 @@ from l2m_factors.keys import D, S, T
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
 
 Rows: TypeAlias = npt.NDArray[np.int64] | slice
+
+
+class Evaluation(NamedTuple):
+    """All residuals of a batch and the values they are of; stored at once, for several threads.
+
+    Attributes
+    ----------
+    seen
+        Of each sensor its values as bytes.
+    residuals
+        Of all readings.
+    """
+
+    seen: dict[int, bytes]
+    residuals: ReadingResiduals
 
 
 class BatchedReadings:
@@ -45,8 +60,7 @@ class BatchedReadings:
         self._sensors = [int(s) for s in np.unique(readings.sensor)]
         self._timed = readings.motion is not None
         self._keys = {s: self._variables(s) for s in self._sensors}
-        self._seen: dict[int, bytes] = {}
-        self._residuals: ReadingResiduals | None = None
+        self._last: Evaluation | None = None
         self._derived: tuple[ReadingResiduals, FloatArray] | None = None
 
     def __len__(self) -> int:
@@ -84,9 +98,10 @@ class BatchedReadings:
             These, if the caller knows them.
         """
         stamp = self.stamp(values, sensor) if stamp is None else stamp
-        if self._residuals is None or self._seen.get(sensor) != stamp:
-            self._residuals = self._evaluated(values)
-        return self._residuals
+        last = self._last
+        if last is None or last.seen.get(sensor) != stamp:
+            self._last = last = self._evaluated(values)
+        return last.residuals
 
     def jacobians(self, residuals: ReadingResiduals) -> list[FloatArray]:
         """Return the derivatives by each of ``keys_of``, each of shape (N, 3, .)."""
@@ -123,9 +138,11 @@ class BatchedReadings:
 
     def jacobian(self, residuals: ReadingResiduals) -> FloatArray:
         """Return the derivatives by all parameters of a sensor, shape (N, 3, sum of widths)."""
-        if self._derived is None or self._derived[0] is not residuals:
-            self._derived = residuals, np.concatenate(self.jacobians(residuals), axis=2)
-        return self._derived[1]
+        derived = self._derived
+        if derived is None or derived[0] is not residuals:
+            derived = residuals, np.concatenate(self.jacobians(residuals), axis=2)
+            self._derived = derived
+        return derived[1]
 
     def stamp(self, values: gtsam.Values, sensor: int) -> bytes:
         """Return the sensor's values as bytes, which compare faster than arrays.
@@ -142,7 +159,7 @@ class BatchedReadings:
         distortion = [D(sensor)] if self._fixed is None else []
         return [T(sensor), *distortion, *([S(sensor)] if self._timed else [])]
 
-    def _evaluated(self, values: gtsam.Values) -> ReadingResiduals:
+    def _evaluated(self, values: gtsam.Values) -> Evaluation:
         # A sensor without values, as when one factor is used alone, is evaluated at zero; nobody
         # asks for it, because its stamp is not kept.
         count = self._sensors[-1] + 1
@@ -155,8 +172,9 @@ class BatchedReadings:
                 distortion[sensor] = values.atVector(D(sensor))
             if offset is not None:
                 offset[sensor] = values.atDouble(S(sensor))
-        self._seen = {sensor: self.stamp(values, sensor) for sensor in present}
-        return reading_residuals(self._readings, self._map, t, distortion, offset)
+        seen = {sensor: self.stamp(values, sensor) for sensor in present}
+        found = reading_residuals(self._readings, self._map, t, distortion, offset)
+        return Evaluation(seen, found)
 
 
 def reading_factor(

@@ -155,8 +155,9 @@ class TileBatch(KeyPoseBatch):
         """Return where the readings on a key pose are, without a query of the field."""
         stamp = self._stamp(values, key_pose)
         if self._places is None or self._placed.get(key_pose) != stamp:
-            if self._seen.get(key_pose) == stamp:
-                point, self._placed = self._point, self._seen
+            last = self._last
+            if last is not None and last.seen.get(key_pose) == stamp:
+                point, self._placed = self._point, last.seen
             else:
                 present = self._present(values)
                 point = self._evaluation_point(values, present)

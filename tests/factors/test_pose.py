@@ -189,6 +189,27 @@ def test_a_factor_alone_needs_only_its_own_variables() -> None:
     assert key_pose_factor(batch, 1, W).error(values) == pytest.approx(alone.error(everything))
 
 
+class Interrupted(MapBatch):
+    """A batch that another thread asks for other values while it stamps what it has evaluated."""
+
+    between: list[gtsam.Values]
+
+    def _stamps(self, values: gtsam.Values, present: list[int]) -> dict[int, bytes]:
+        if self.between:
+            self.residuals(self.between.pop(), 0)
+        return super()._stamps(values, present)
+
+
+def test_two_threads_get_their_own_residuals() -> None:
+    one, other = values_for(8), values_for(9)
+    world, readings = dipole_world(8), random_carried(8)
+    batch = Interrupted(world, readings)
+    batch.between = [other]
+    for values in (one, other, one):
+        alone = MapBatch(world, readings).residuals(values, 0).reading.residual
+        np.testing.assert_array_equal(batch.residuals(values, 0).reading.residual, alone)
+
+
 def test_a_sensor_that_comes_later_is_not_asked_for() -> None:
     """On line, values have all key poses so far, but no calibration of a sensor yet to come."""
     everything, readings = values_for(5), random_carried(5)

@@ -170,6 +170,28 @@ def test_blocks_equal_readings() -> None:
         assert np.linalg.norm(a.atPoint3(T(i)) - sensors[i].t_lidar_mag) < 0.02
 
 
+class InterruptedWorld(CountingWorld):
+    """A map during whose query another thread asks the same batch for other values."""
+
+    batch: BatchedReadings
+    between: list[gtsam.Values]
+
+    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if self.between:
+            self.batch.residuals(self.between.pop(), 0)
+        return super().field_and_gradient(points)
+
+
+def test_two_threads_get_their_own_residuals() -> None:
+    one, other, plain = random_values(8, 2), random_values(9, 2), dipole_world(8)
+    readings = as_magnetic(drive(8, random_sensors(8, 2), plain, count=4))
+    world = InterruptedWorld(plain)
+    world.batch, world.between = BatchedReadings(world, readings), [other]
+    for values in (one, other, one):
+        alone = BatchedReadings(plain, readings).residuals(values, 0).residual
+        np.testing.assert_array_equal(world.batch.residuals(values, 0).residual, alone)
+
+
 def test_a_pose_moves_as_its_twist_says() -> None:
     """Half a second of a quarter turn a second to the left while driving 2 m/s ahead."""
     R = Rotation.from_euler("z", 90, degrees=True).as_matrix()[None]
