@@ -74,12 +74,15 @@ class State(NamedTuple):
         Sum of the shared errors in the lidar frame in uT, shape (n, 3).
     residual
         ``e`` in uT, shape (n, 3).
+    white
+        ``W e``, shape (3 n,).
     """
 
     stamp: bytes
     C: FloatArray
     shared: FloatArray
     residual: FloatArray
+    white: FloatArray
 
 
 class UncertainReadings:
@@ -116,43 +119,44 @@ class UncertainReadings:
         widths = [each.features.shape[2] for each in errors]
         ends = np.cumsum([0, *batch.widths, *widths]).tolist()
         self._blocks = tuple(slice(*pair) for pair in pairwise(ends))
-        self._state = State(b"", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
-        self._white = np.empty(0)
-        self._linearised: WhiteRows | None = None
+        self._state: State | None = None
+        self._linearised: tuple[State, WhiteRows] | None = None
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def residual(self, values: gtsam.Values) -> FloatArray:
         """Return ``e`` in uT, shape (n, 3)."""
-        self.white_residual(values)
-        return self._state.residual
+        return self._state_at(values).residual
 
     def white_residual(self, values: gtsam.Values) -> FloatArray:
         """Return ``W e``, shape (3 n,), evaluated anew only if the values changed."""
-        own = self._batch.stamp(values, self.sensor)
-        weights = np.concatenate([values.atVector(key) for key in self._weights])
-        stamp = own + weights.tobytes()
-        if stamp != self._state.stamp:
-            C = np.frombuffer(own)[self._blocks[1]][:9].reshape(3, 3)
-            shared = self._features @ weights
-            e = self._batch.residuals(values, self.sensor, own).residual[self._rows] + shared @ C.T
-            self._state = State(stamp, C, shared, e)
-            self._white = whitened(self._W, e[:, :, None]).ravel()
-            self._linearised = None
-        return self._white
+        return self._state_at(values).white
 
     def linearised(self, values: gtsam.Values) -> WhiteRows:
         """Return residuals and derivatives, evaluated anew only if the values changed."""
-        white = self.white_residual(values)
-        if self._linearised is None:
-            jacobian = whitened(self._W, self._jacobian(values))
-            self._linearised = WhiteRows(white, jacobian, self._blocks)
-        return self._linearised
+        state, last = self._state_at(values), self._linearised
+        if last is None or last[0] is not state:
+            jacobian = whitened(self._W, self._jacobian(values, state))
+            self._linearised = last = state, WhiteRows(state.white, jacobian, self._blocks)
+        return last[1]
 
-    def _jacobian(self, values: gtsam.Values) -> FloatArray:
+    def _state_at(self, values: gtsam.Values) -> State:
+        """Return the last state, or that of changed values, kept for the next call."""
+        own, state = self._batch.stamp(values, self.sensor), self._state
+        weights = np.concatenate([values.atVector(key) for key in self._weights])
+        stamp = own + weights.tobytes()
+        if state is None or state.stamp != stamp:
+            C = np.frombuffer(own)[self._blocks[1]][:9].reshape(3, 3)
+            shared = self._features @ weights
+            e = self._batch.residuals(values, self.sensor, own).residual[self._rows] + shared @ C.T
+            state = State(stamp, C, shared, e, whitened(self._W, e[:, :, None]).ravel())
+            self._state, self._linearised = state, None
+        return state
+
+    def _jacobian(self, values: gtsam.Values, state: State) -> FloatArray:
         """Return derivatives by all variables, shape (n, 3, k), where the residual was taken."""
-        state, by_C = self._state, self._blocks[1].start
+        by_C = self._blocks[1].start
         own = self._batch.jacobian(self._batch.residuals(values, self.sensor))
         J = np.empty((len(self), 3, self._blocks[-1].stop))
         J[:, :, : own.shape[2]] = own[self._rows]

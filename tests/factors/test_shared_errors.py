@@ -14,6 +14,7 @@ from l2m_factors import (
     M,
     MagneticReadings,
     P,
+    ReadingResiduals,
     SharedError,
     UncertainReadings,
     assert_jacobians_match,
@@ -158,6 +159,31 @@ def test_a_factor_for_each_reading_is_as_good_as_one_for_all(dense: bool) -> Non
         np.testing.assert_array_equal(np.concatenate([part[0] for part in parts]), J)
         np.testing.assert_array_equal(np.concatenate([part[1] for part in parts]), b)
         assert sum(factor.error(at) for factor in each) == pytest.approx(0.5 * b @ b, rel=1e-12)
+
+
+class Interrupted(BatchedReadings):
+    """A batch during whose derivatives another thread asks the readings for other values."""
+
+    group: UncertainReadings
+    between: list[gtsam.Values]
+
+    def jacobian(self, residuals: ReadingResiduals) -> FloatArray:
+        if self.between:
+            self.group.white_residual(self.between.pop())
+        return super().jacobian(residuals)
+
+
+def test_two_threads_get_their_own_rows() -> None:
+    one, other, world = with_weights(2, 2), with_weights(3, 2), dipole_world(2)
+    rows, errors, W = np.arange(5, 8), in_tile(7, features(2, 3, 4)), whitenings(2, 3)
+    batch = Interrupted(world, some_readings(2, world))
+    batch.between, batch.group = [other], UncertainReadings(batch, rows, errors, W)
+    plain = BatchedReadings(world, some_readings(2, world))
+    for values in (one, other, one):
+        alone = UncertainReadings(plain, rows, errors, W).linearised(values)
+        found = batch.group.linearised(values)
+        np.testing.assert_array_equal(found.residual, alone.residual)
+        np.testing.assert_array_equal(found.jacobian, alone.jacobian)
 
 
 def test_a_reading_adds_to_those_before_it_only() -> None:
