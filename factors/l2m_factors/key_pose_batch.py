@@ -163,10 +163,18 @@ class KeyPoseBatch(ABC):
         Calibrations that are no variables. Without them the factors depend on ``T(i)`` and
         ``D(i)`` of each sensor that read at the key pose, and for readings with motion on
         ``S(i)``.
+
+    Raises
+    ------
+    ValueError
+        An array has another shape, a sensor no calibration, or a number is not finite: leave such a
+        reading out. The line names it.
     """
 
     def __init__(self, readings: KeyPoseReadings, fixed: Calibrations | None) -> None:
-        self._readings, self._variables = readings, SensorVariables(readings, fixed)
+        readings = readings.checked()
+        known = None if fixed is None else fixed.checked(readings.sensor)
+        self._readings, self._variables = readings, SensorVariables(readings, known)
         numbers, self._slot = np.unique(readings.key_pose, return_inverse=True)
         self._rows = {int(k): np.flatnonzero(self._slot == n) for n, k in enumerate(numbers)}
         self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}

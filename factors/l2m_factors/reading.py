@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from l2m_factors.arguments import index, noise_of, numbers
 from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.keys import D, S, T
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
@@ -46,6 +47,12 @@ class BatchedReadings:
     distortion
         Fixed distortions (C row by row, H in uT), shape (S, 12). Without it the factors depend on
         ``D(i)``; they always do on ``T(i)``.
+
+    Raises
+    ------
+    ValueError
+        An array has another shape, a sensor no distortion, or a number is not finite: leave such a
+        reading out. The line names it.
     """
 
     def __init__(
@@ -55,8 +62,8 @@ class BatchedReadings:
         distortion: FloatArray | None = None,
     ) -> None:
         self._map = field_map
-        self._readings = readings
-        self._fixed = distortion
+        self._readings = readings = readings.checked()
+        self._fixed = None if distortion is None else _held(distortion, readings)
         self._sensors = [int(s) for s in np.unique(readings.sensor)]
         self._timed = readings.motion is not None
         self._keys = {s: self._variables(s) for s in self._sensors}
@@ -190,8 +197,13 @@ def reading_factor(
         Index of the reading in the batch.
     noise_model
         Noise of its three axes in microtesla; any Gaussian or robust model.
+
+    Raises
+    ------
+    ValueError
+        The batch has no such reading, or the noise is not of three components.
     """
-    sensor = batch.sensor_of(reading)
+    sensor = batch.sensor_of(index("reading", reading, len(batch)))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, sensor)
@@ -200,7 +212,7 @@ def reading_factor(
                 jacobians[slot] = jacobian[reading]
         return np.asarray(residuals.residual[reading])
 
-    return gtsam.CustomFactor(noise_model, batch.keys_of(sensor), error)
+    return gtsam.CustomFactor(noise_of(noise_model, 3), batch.keys_of(sensor), error)
 
 
 def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> gtsam.CustomFactor:
@@ -215,9 +227,18 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
     whitening
         For each reading of the batch the matrix W that makes the noise of ``W e`` white with unit
         variance, in 1/uT, shape (N, 3, 3).
+
+    Raises
+    ------
+    ValueError
+        The sensor has no reading, or the whitening another shape.
     """
-    rows = _span(batch.rows_of(sensor))
-    W = whitening[rows]
+    own = batch.rows_of(sensor)
+    if not len(own):
+        raise ValueError(f"sensor: {sensor} has no reading; of {batch.sensors} there are some")
+    if np.shape(whitening) != (needed := (len(batch), 3, 3)):
+        raise ValueError(f"whitening: of shape {np.shape(whitening)}; needed is {needed}")
+    rows, W = _span(own), numbers("whitening", whitening[own], (len(own), 3, 3))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, sensor)
@@ -228,6 +249,15 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
 
     unit = gtsam.noiseModel.Unit.Create(3 * len(W))
     return gtsam.CustomFactor(unit, batch.keys_of(sensor), error)
+
+
+def _held(distortion: FloatArray, readings: MagneticReadings) -> FloatArray:
+    """Return a copy of fixed distortions, shape (S, 12)."""
+    S = len(distortion)
+    largest = int(readings.sensor.max(initial=-1))
+    if largest >= S:
+        raise ValueError(f"sensor: {largest}; there are distortions of {S} sensors, from 0")
+    return numbers("distortion", distortion, (S, 12))
 
 
 def _span(rows: npt.NDArray[np.int64]) -> Rows:

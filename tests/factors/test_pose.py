@@ -1,6 +1,8 @@
 """Readings on poses that are variables: derivatives on the manifold, batching, and agreement."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -187,6 +189,36 @@ def test_a_factor_alone_needs_only_its_own_variables() -> None:
     W = whitenings(5, len(mine))
     alone = key_pose_factor(MapBatch(dipole_world(5), mine), 1, W)
     assert key_pose_factor(batch, 1, W).error(values) == pytest.approx(alone.error(everything))
+
+
+def test_arrays_that_are_written_into_later_change_no_batch() -> None:
+    values, readings = values_for(8), random_carried(8)
+    fixed = calibrations(values)
+    batch, world = MapBatch(dipole_world(8), readings, fixed), dipole_world(8)
+    expected = MapBatch(world, readings, fixed).residuals(values, 0).reading.residual
+    for array in (readings.field, readings.p_key_lidar, readings.sensor, fixed.t, fixed.distortion):
+        array[:] = 0
+    found = batch.residuals(values, 0).reading.residual
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "of", "line"),
+    [
+        ("field", lambda field: field[:1], r"field: of shape \(1, 3\); needed is \(8, 3\)"),
+        ("field", lambda field: np.nan * field, "field: row 0 is not finite"),
+        ("key_pose", lambda key_pose: key_pose[:1], r"key_pose: of shape \(1,\); needed is \(8,\)"),
+        ("sensor", lambda sensor: sensor + 1, "sensor: 2; there are calibrations of 2 sensors"),
+    ],
+)
+def test_a_batch_of_wrong_readings_is_refused(
+    name: str, of: Callable[[Any], Any], line: str
+) -> None:
+    readings = random_carried(8)
+    change: dict[str, Any] = {name: of(getattr(readings, name))}
+    wrong = replace(readings, **change)
+    with pytest.raises(ValueError, match=line):
+        MapBatch(dipole_world(8), wrong, calibrations(values_for(8)))
 
 
 class Interrupted(MapBatch):
