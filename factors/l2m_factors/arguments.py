@@ -33,13 +33,18 @@ def numbers(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatAr
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: not an array of numbers; needed is shape {shape}") from error
-    if array.shape != shape:
-        raise ValueError(f"{name}: of shape {array.shape}; needed is {shape}")
+    of_shape(name, array, shape)
     finite = np.isfinite(array)
     if not finite.all():
         row = int(np.argwhere(~finite)[0, 0])
         raise ValueError(f"{name}: row {row} is not finite; leave it out or give numbers")
     return array
+
+
+def of_shape(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> None:
+    """Raise a ValueError for an array of another shape, of which no copy is needed."""
+    if np.shape(values) != shape:
+        raise ValueError(f"{name}: of shape {np.shape(values)}; needed is {shape}")
 
 
 def indices(name: str, values: npt.ArrayLike, count: int | None = None) -> npt.NDArray[np.int64]:
@@ -63,8 +68,8 @@ def indices(name: str, values: npt.ArrayLike, count: int | None = None) -> npt.N
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         needed = "integers of shape (n,); np.flatnonzero makes them of a mask"
         raise ValueError(f"{name}: {array.dtype} of shape {array.shape}; needed are {needed}")
-    if count is not None and len(array) != count:
-        raise ValueError(f"{name}: of shape {array.shape}; needed is ({count},)")
+    if count is not None:
+        of_shape(name, array, (count,))
     if array.min(initial=0) < 0:
         raise ValueError(f"{name}: {array.min()} is negative; indices count from 0")
     return array.astype(np.int64)

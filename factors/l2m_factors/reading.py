@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.arguments import index, noise_of, numbers
+from l2m_factors.arguments import index, noise_of, numbers, of_shape
 from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.keys import D, S, T
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
@@ -236,8 +236,7 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
     own = batch.rows_of(sensor)
     if not len(own):
         raise ValueError(f"sensor: {sensor} has no reading; of {batch.sensors} there are some")
-    if np.shape(whitening) != (needed := (len(batch), 3, 3)):
-        raise ValueError(f"whitening: of shape {np.shape(whitening)}; needed is {needed}")
+    of_shape("whitening", whitening, (len(batch), 3, 3))
     rows, W = _span(own), numbers("whitening", whitening[own], (len(own), 3, 3))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:

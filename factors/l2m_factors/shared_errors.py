@@ -19,8 +19,9 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from l2m_factors.arguments import index, indices, of_shape
 from l2m_factors.field_map import FloatArray, Jacobians
-from l2m_factors.keys import M, P
+from l2m_factors.keys import D, M, P
 from l2m_factors.reading import BatchedReadings
 
 POSE = 6  # rotation and translation
@@ -40,6 +41,11 @@ class SharedError:
 
     key: int
     features: FloatArray
+
+    def check(self, count: int) -> None:
+        """Raise a ValueError if it is not one of so many readings."""
+        name, size = gtsam.DefaultKeyFormatter(self.key), np.shape(self.features)[-1:]
+        of_shape(f"features of {name}", self.features, (count, 3, *size))
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,14 @@ class UncertainReadings:
         What they share.
     whitening
         Matrix that makes the noise of ``W e`` white with unit variance, in 1/uT: one for each
-        reading, shape (n, 3, 3), or a lower triangular one for all of them, shape (3 n, 3 n).
+        reading, shape (n, 3, 3), or a lower triangular one for all of them, shape (3 n, 3 n). It
+        may be large and is not copied.
+
+    Raises
+    ------
+    ValueError
+        There is no reading or no error, readings are of several sensors, distortions are held in
+        the batch, or an array has another shape. The line says which.
     """
 
     def __init__(
@@ -111,7 +124,14 @@ class UncertainReadings:
         errors: Sequence[SharedError],
         whitening: FloatArray,
     ) -> None:
-        self.sensor = batch.sensor_of(int(rows[0]))
+        rows = indices("rows", rows)
+        self.sensor = _only_sensor(batch, rows)
+        n = len(rows)
+        of_shape("whitening", whitening, (3 * n, 3 * n) if np.ndim(whitening) == 2 else (n, 3, 3))
+        if not errors:
+            raise ValueError("errors: none; block_factor is for readings that share none")
+        for each in errors:
+            each.check(n)
         self.keys = [*batch.keys_of(self.sensor), *(each.key for each in errors)]
         self._batch, self._rows, self._W = batch, rows, whitening
         self._weights = [each.key for each in errors]
@@ -194,7 +214,13 @@ def uncertain_reading_factor(readings: UncertainReadings, reading: int) -> gtsam
         Those that share errors.
     reading
         Which of them, from 0.
+
+    Raises
+    ------
+    ValueError
+        There is no such reading.
     """
+    index("reading", reading, len(readings))
     own = slice(3 * reading, 3 * reading + 3)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
@@ -205,6 +231,19 @@ def uncertain_reading_factor(readings: UncertainReadings, reading: int) -> gtsam
         return found.residual[own]
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), readings.keys, error)
+
+
+def _only_sensor(batch: BatchedReadings, rows: npt.NDArray[np.int64]) -> int:
+    """Return the sensor of all these readings, whose distortion must be a variable."""
+    if not len(rows):
+        raise ValueError("rows: none; at least one reading is needed")
+    sensors = sorted({batch.sensor_of(index("rows", row, len(batch))) for row in rows.tolist()})
+    if len(sensors) > 1:
+        raise ValueError(f"rows: of sensors {sensors}; make UncertainReadings of each sensor")
+    if D(sensors[0]) not in batch.keys_of(sensors[0]):
+        name = f"D{sensors[0]}"
+        raise ValueError(f"batch: its distortions are held; leave them out, with a prior on {name}")
+    return sensors[0]
 
 
 def shared_error(errors: Sequence[SharedError], values: gtsam.Values) -> FloatArray:
