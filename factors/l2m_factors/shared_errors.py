@@ -268,8 +268,15 @@ def map_weights_prior(sizes: Mapping[int, int], root_information: FloatArray) ->
         Number of weights of each tile, by its index.
     root_information
         Matrix R with ``R^T R`` the inverse of their covariance, columns tile by tile in the order
-        of ``sizes``, shape (K, K).
+        of ``sizes``, shape (K, K). It may be large and is not copied.
+
+    Raises
+    ------
+    ValueError
+        It has another shape.
     """
+    whole = sum(sizes.values())
+    of_shape("root_information", root_information, (whole, whole))
     ends = np.cumsum(list(sizes.values()))
     blocks = np.split(root_information, ends[:-1], axis=1)
 
@@ -298,8 +305,14 @@ def map_weights_information(
         As of ``map_weights_prior``.
     information
         Inverse of the covariance; its lower triangle is enough, shape (K, K).
+
+    Raises
+    ------
+    ValueError
+        It has another shape.
     """
     ends = np.cumsum([0, *sizes.values()]).tolist()
+    of_shape("information", information, (ends[-1], ends[-1]))
     at = {tile: slice(*pair) for tile, pair in zip(sizes, pairwise(ends), strict=True)}
     nothing = {tile: (np.zeros((size, size)), np.zeros(size)) for tile, size in sizes.items()}
     pairs, zero = gtsam.GaussianFactorGraph(), gtsam.Values()
@@ -322,7 +335,15 @@ def pose_errors_prior(correlation: Sequence[float]) -> gtsam.NonlinearFactorGrap
     ----------
     correlation
         Between each knot and the next, 0 to 1 (excluded); there is one knot more.
+
+    Raises
+    ------
+    ValueError
+        A correlation is not in that range.
     """
+    for knot, like in enumerate(correlation):
+        if not 0 <= like < 1:
+            raise ValueError(f"correlation: {like:g} of knot {knot}; needed is 0 to 1 (excluded)")
     graph = gtsam.NonlinearFactorGraph()
     unit = gtsam.noiseModel.Unit.Create(POSE)
     graph.add(gtsam.PriorFactorVector(P(0), np.zeros(POSE), unit))
