@@ -190,7 +190,9 @@ class KeyPoseBatch(ABC):
         return list(self._rows)
 
     def rows_of(self, key_pose: int) -> npt.NDArray[np.int64]:
-        """Return the indices of the readings on a key pose."""
+        """Return the indices of the readings on a key pose; a ValueError where there are none."""
+        if key_pose not in self._rows:
+            raise ValueError(f"key_pose: {key_pose} has no readings; see key_poses of the batch")
         return self._rows[key_pose]
 
     def residuals(self, values: gtsam.Values, key_pose: int) -> KeyPoseResiduals:

@@ -47,6 +47,11 @@ class SharedError:
         name, size = gtsam.DefaultKeyFormatter(self.key), np.shape(self.features)[-1:]
         of_shape(f"features of {name}", self.features, (count, 3, *size))
 
+    def checked(self, count: int) -> "SharedError":
+        """Return a copy for so many readings; a ValueError if it is of another number of them."""
+        self.check(count)
+        return SharedError(self.key, np.array(self.features, dtype=np.float64))
+
 
 @dataclass(frozen=True)
 class WhiteRows:

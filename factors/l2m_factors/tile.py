@@ -268,9 +268,15 @@ def tile_residual(
         What the error of the step to the next key pose adds to them; nothing without.
     slow
         What they have of a slow error of their sensor; nothing without.
+
+    Raises
+    ------
+    ValueError
+        There are no readings on the key pose, or an array is of another number of readings.
     """
     rows = batch.rows_of(key_pose)
-    terms = [each for each in (step, slow) if each is not None]
+    whitening = whitening.checked(len(rows))
+    terms = [each.checked(len(rows)) for each in (step, slow) if each is not None]
     slots = Slots([*batch.keys_of(key_pose), *(key for each in terms for key in each.keys)])
 
     def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:

@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from l2m_factors.arguments import numbers
 from l2m_factors.complexity import ComplexityPenalty
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.joint_residual import Residual
@@ -111,6 +112,11 @@ class TileBlocks(TileBatch):
         As of ``TileBatch``.
     whitening
         Of each of N readings, 1/uT, shape (N, 3, 3).
+
+    Raises
+    ------
+    ValueError
+        As of ``TileBatch``, or the whitening is of another number of readings.
     """
 
     def __init__(
@@ -123,7 +129,7 @@ class TileBlocks(TileBatch):
         fixed: Calibrations | None = None,
     ) -> None:
         super().__init__(number, anchor, field, readings, fixed)
-        self._W = whitening
+        self._W = numbers("whitening", whitening, (len(readings), 3, 3))
         self._on_anchor = self._rows.get(anchor, np.empty(0, dtype=np.int64))
         poses = [X(k) for k in dict.fromkeys([*self._rows, anchor])]
         self._every_key = [*poses, M(number), *self._variables.keys(self._every_sensor)]

@@ -1,5 +1,6 @@
 """Readings on poses that are variables: derivatives on the manifold, batching, and agreement."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -219,6 +220,32 @@ def test_a_batch_of_wrong_readings_is_refused(
     wrong = replace(readings, **change)
     with pytest.raises(ValueError, match=line):
         MapBatch(dipole_world(8), wrong, calibrations(values_for(8)))
+
+
+def test_arrays_that_are_written_into_later_change_no_factor() -> None:
+    values, readings = values_for(8, 3), random_carried(8)
+    W, step = whitenings(8, 4), step_error(8, 4, values)
+    shared = SharedError(M(7), np.ones((4, 3, MODES)))
+    batch = MapBatch(dipole_world(8), readings)
+    factor = key_pose_factor(batch, 1, W, [shared], step)
+    before = factor.error(values)
+    for array in (W.own, W.common, step.slope, shared.features):
+        array[:] = 0
+        assert factor.error(values) == before
+
+
+def test_a_factor_of_wrong_arguments_is_refused_in_one_line() -> None:
+    values, W = values_for(8, 3), whitenings(8, 4)
+    batch = MapBatch(dipole_world(8), random_carried(8))
+    flat, off = Whitening(W.own[0], W.common), step_error(8, 1, values)
+    for k, white, step, line in (
+        (7, W, None, "key_pose: 7 has no readings; see key_poses of the batch"),
+        (1, whitenings(8, 3), None, "Whitening.own: of shape (3, 3, 3); needed is (4, 3, 3)"),
+        (1, flat, None, "Whitening.own: of shape (3, 3); needed is (4, 3, 3)"),
+        (1, W, off, "StepError.slope: of shape (1, 3, 6); needed is (4, 3, 6)"),
+    ):
+        with pytest.raises(ValueError, match=f"^{re.escape(line)}$"):
+            key_pose_factor(batch, k, white, step=step)
 
 
 class Interrupted(MapBatch):
