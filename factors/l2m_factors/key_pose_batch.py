@@ -132,7 +132,7 @@ class SensorVariables:
         return [T(sensor), D(sensor), *([S(sensor)] if self.timed else [])]
 
 
-class Evaluation(NamedTuple):
+class KeyPoseEvaluation(NamedTuple):
     """All residuals of a batch and the values they are of; stored at once, for several threads.
 
     Attributes
@@ -179,7 +179,7 @@ class KeyPoseBatch(ABC):
         self._rows = {int(k): np.flatnonzero(self._slot == n) for n, k in enumerate(numbers)}
         self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}
         self._every_sensor = self._variables.on(np.arange(len(readings)))
-        self._last: Evaluation | None = None
+        self._last: KeyPoseEvaluation | None = None
 
     def __len__(self) -> int:
         return len(self._readings)
@@ -203,7 +203,9 @@ class KeyPoseBatch(ABC):
         stamp, last = self._stamp(values, key_pose), self._last
         if last is None or last.seen.get(key_pose) != stamp:
             present = self._present(values)
-            last = Evaluation(self._stamps(values, present), self._evaluated(values, present))
+            last = KeyPoseEvaluation(
+                self._stamps(values, present), self._evaluated(values, present)
+            )
             self._last = last
         return last.residuals
 

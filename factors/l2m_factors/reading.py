@@ -19,7 +19,7 @@ from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_res
 Rows: TypeAlias = npt.NDArray[np.int64] | slice
 
 
-class Evaluation(NamedTuple):
+class ReadingEvaluation(NamedTuple):
     """All residuals of a batch and the values they are of; stored at once, for several threads.
 
     Attributes
@@ -67,7 +67,7 @@ class BatchedReadings:
         self._sensors = [int(s) for s in np.unique(readings.sensor)]
         self._timed = readings.motion is not None
         self._keys = {s: self._variables(s) for s in self._sensors}
-        self._last: Evaluation | None = None
+        self._last: ReadingEvaluation | None = None
         self._derived: tuple[ReadingResiduals, FloatArray] | None = None
 
     def __len__(self) -> int:
@@ -166,7 +166,7 @@ class BatchedReadings:
         distortion = [D(sensor)] if self._fixed is None else []
         return [T(sensor), *distortion, *([S(sensor)] if self._timed else [])]
 
-    def _evaluated(self, values: gtsam.Values) -> Evaluation:
+    def _evaluated(self, values: gtsam.Values) -> ReadingEvaluation:
         # A sensor without values, as when one factor is used alone, is evaluated at zero; nobody
         # asks for it, because its stamp is not kept.
         count = self._sensors[-1] + 1
@@ -181,7 +181,7 @@ class BatchedReadings:
                 offset[sensor] = values.atDouble(S(sensor))
         seen = {sensor: self.stamp(values, sensor) for sensor in present}
         found = reading_residuals(self._readings, self._map, t, distortion, offset)
-        return Evaluation(seen, found)
+        return ReadingEvaluation(seen, found)
 
 
 def reading_factor(
