@@ -100,7 +100,7 @@ class TilePlaces:
 
 
 class TileBatch(KeyPoseBatch):
-    """Readings on key poses in one tile.
+    """Readings on key poses in one tile, for one thread at a time.
 
     Parameters
     ----------

@@ -104,7 +104,7 @@ def run_of(numbers: npt.NDArray[np.int64], number: int) -> slice:
 
 
 class TileBlocks(TileBatch):
-    """Readings on key poses in one tile, each with noise of its own.
+    """Readings on key poses in one tile, each with noise of its own, for one thread at a time.
 
     Parameters
     ----------
