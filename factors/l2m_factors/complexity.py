@@ -27,6 +27,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from l2m_factors.arguments import numbers
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.joint_residual import Residual
 from l2m_factors.tile import TileBatch
@@ -52,6 +53,14 @@ class ComplexityPenalty:
 
     def __getitem__(self, rows: npt.NDArray[np.int64]) -> "ComplexityPenalty":
         return ComplexityPenalty(self.at[rows], self.value[rows], self.slope[rows])
+
+    def checked(self, count: int) -> "ComplexityPenalty":
+        """Return a copy for so many readings; a ValueError if it is of another number of them."""
+        return ComplexityPenalty(
+            numbers("ComplexityPenalty.at", self.at, (count, 3)),
+            numbers("ComplexityPenalty.value", self.value, (count,)),
+            numbers("ComplexityPenalty.slope", self.slope, (count, 3)),
+        )
 
     @property
     def parameters(self) -> float:
@@ -88,7 +97,13 @@ def effective_parameters(
         Number k of the key pose.
     penalty
         Of the n readings.
+
+    Raises
+    ------
+    ValueError
+        There are no readings on the key pose, or the penalty is of another number of readings.
     """
+    penalty = penalty.checked(len(batch.rows_of(key_pose)))
     keys = batch.place_keys_of(key_pose)
     if not keys:
         return None

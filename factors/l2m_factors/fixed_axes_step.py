@@ -11,6 +11,7 @@ of the frame of the poses
 import gtsam
 import numpy as np
 
+from l2m_factors.arguments import noise_of, numbers
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.keys import X
 from l2m_factors.motion import skew
@@ -31,13 +32,19 @@ def fixed_axes_step_factor(
         From one to the next along the axes that poses are in, metres, shape (3,).
     noise
         Of a right perturbation of the next pose, rotation (rad) before translation (m).
+
+    Raises
+    ------
+    ValueError
+        The way is not of three finite numbers, or the noise not of six components.
     """
+    way = numbers("way", way, (3,))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         poses = [values.atPose3(X(key_pose + end)) for end in (0, 1)]
         return fixed_axes_residual(poses, turn, way, jacobians)
 
-    return gtsam.CustomFactor(noise, [X(key_pose), X(key_pose + 1)], error)
+    return gtsam.CustomFactor(noise_of(noise, 6), [X(key_pose), X(key_pose + 1)], error)
 
 
 def fixed_axes_residual(

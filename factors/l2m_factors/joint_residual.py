@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from l2m_factors.arguments import noise_of
 from l2m_factors.field_map import FloatArray, Jacobians
 
 
@@ -34,8 +35,15 @@ class Residual:
     error: Callable[[gtsam.Values, Jacobians], FloatArray]
 
     def factor(self, noise: gtsam.noiseModel.Base | None = None) -> gtsam.CustomFactor:
-        """Return it as a factor; without a noise model it is white with unit variance."""
-        model = gtsam.noiseModel.Unit.Create(self.size) if noise is None else noise
+        """Return it as a factor; without a noise model it is white with unit variance.
+
+        Raises
+        ------
+        ValueError
+            The noise is not of n components.
+        """
+        unit = gtsam.noiseModel.Unit.Create(self.size)
+        model = unit if noise is None else noise_of(noise, self.size)
         return gtsam.CustomFactor(model, self.keys, lambda _, *at: self.error(*at))
 
     def whitened(self, noise: gtsam.noiseModel.Gaussian) -> "Residual":

@@ -2,6 +2,7 @@
 
 import struct
 from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -63,13 +64,18 @@ class SensorVariables:
         if self._fixed is not None:
             return self._fixed
         known = Calibrations.zeros(max(sensors) + 1)
-        for sensor in sensors:
-            if values.exists(T(sensor)):
-                known.t[sensor] = values.atPoint3(T(sensor))
-                known.distortion[sensor] = values.atVector(D(sensor))
-                if self.timed:
-                    known.offset[sensor] = values.atDouble(S(sensor))
+        for sensor in self.known(values, sensors):
+            known.t[sensor] = values.atPoint3(T(sensor))
+            known.distortion[sensor] = values.atVector(D(sensor))
+            if self.timed:
+                known.offset[sensor] = values.atDouble(S(sensor))
         return known
+
+    def known(self, values: gtsam.Values, sensors: list[int]) -> list[int]:
+        """Return those of these sensors whose calibrations values have: on line, some come late."""
+        if self._fixed is not None:
+            return sensors
+        return [each for each in sensors if values.exists(T(each))]
 
     def C(self, values: gtsam.Values, rows: npt.NDArray[np.int64]) -> FloatArray:
         """Return the distortion matrix of each of n readings, shape (n, 3, 3)."""
@@ -126,6 +132,21 @@ class SensorVariables:
         return [T(sensor), D(sensor), *([S(sensor)] if self.timed else [])]
 
 
+class KeyPoseEvaluation(NamedTuple):
+    """All residuals of a batch and the values they are of; stored at once, for several threads.
+
+    Attributes
+    ----------
+    seen
+        Of each key pose what its readings depend on, as bytes.
+    residuals
+        Of all readings.
+    """
+
+    seen: dict[int, bytes]
+    residuals: KeyPoseResiduals
+
+
 class KeyPoseBatch(ABC):
     """What batches of readings on key poses have in common.
 
@@ -142,15 +163,23 @@ class KeyPoseBatch(ABC):
         Calibrations that are no variables. Without them the factors depend on ``T(i)`` and
         ``D(i)`` of each sensor that read at the key pose, and for readings with motion on
         ``S(i)``.
+
+    Raises
+    ------
+    ValueError
+        An array has another shape, a sensor no calibration, or a number is not finite: leave such a
+        reading out. The line names it.
     """
 
     def __init__(self, readings: KeyPoseReadings, fixed: Calibrations | None) -> None:
-        self._readings, self._variables = readings, SensorVariables(readings, fixed)
+        readings = readings.checked()
+        known = None if fixed is None else fixed.checked(readings.sensor)
+        self._readings, self._variables = readings, SensorVariables(readings, known)
         numbers, self._slot = np.unique(readings.key_pose, return_inverse=True)
         self._rows = {int(k): np.flatnonzero(self._slot == n) for n, k in enumerate(numbers)}
         self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}
-        self._seen: dict[int, bytes] = {}
-        self._residuals: KeyPoseResiduals | None = None
+        self._every_sensor = self._variables.on(np.arange(len(readings)))
+        self._last: KeyPoseEvaluation | None = None
 
     def __len__(self) -> int:
         return len(self._readings)
@@ -161,7 +190,9 @@ class KeyPoseBatch(ABC):
         return list(self._rows)
 
     def rows_of(self, key_pose: int) -> npt.NDArray[np.int64]:
-        """Return the indices of the readings on a key pose."""
+        """Return the indices of the readings on a key pose; a ValueError where there are none."""
+        if key_pose not in self._rows:
+            raise ValueError(f"key_pose: {key_pose} has no readings; see key_poses of the batch")
         return self._rows[key_pose]
 
     def residuals(self, values: gtsam.Values, key_pose: int) -> KeyPoseResiduals:
@@ -169,12 +200,14 @@ class KeyPoseBatch(ABC):
 
         Those of key poses without values mean nothing, as when one factor is used alone.
         """
-        stamp = self._stamp(values, key_pose)
-        if self._residuals is None or self._seen.get(key_pose) != stamp:
-            present = [k for k in self._rows if self._is_present(values, k)]
-            self._residuals = self._evaluated(values, present)
-            self._seen = {k: self._stamp(values, k) for k in present}
-        return self._residuals
+        stamp, last = self._stamp(values, key_pose), self._last
+        if last is None or last.seen.get(key_pose) != stamp:
+            present = self._present(values)
+            last = KeyPoseEvaluation(
+                self._stamps(values, present), self._evaluated(values, present)
+            )
+            self._last = last
+        return last.residuals
 
     @abstractmethod
     def _pose(self, values: gtsam.Values, key_pose: int) -> gtsam.Pose3:
@@ -191,6 +224,15 @@ class KeyPoseBatch(ABC):
     @abstractmethod
     def _own_stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
         """Return what pose and field depend on as bytes, which compare faster than arrays."""
+
+    def _present(self, values: gtsam.Values) -> list[int]:
+        return [k for k in self._rows if self._is_present(values, k)]
+
+    def _stamps(self, values: gtsam.Values, present: list[int]) -> dict[int, bytes]:
+        """Return the stamps of those key poses whose sensors are all known."""
+        known = set(self._variables.known(values, self._every_sensor))
+        complete = (k for k in present if known.issuperset(self._sensors[k]))
+        return {k: self._stamp(values, k) for k in complete}
 
     def _stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
         of_sensors = self._variables.stamp(values, self._sensors[key_pose])
@@ -210,5 +252,5 @@ class KeyPoseBatch(ABC):
         for k in present:
             pose = self._pose(values, k)
             R[slots[k]], p[slots[k]] = pose.rotation().matrix(), pose.translation()
-        sensors = self._variables.calibrations(values, self._variables.on(np.arange(len(self))))
+        sensors = self._variables.calibrations(values, self._every_sensor)
         return R[self._slot], p[self._slot], sensors

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from l2m_factors.arguments import indices, numbers
 from l2m_factors.field_map import DifferentiableMap, FloatArray
 from l2m_factors.motion import PoseMotion, moved, skew
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
@@ -73,6 +74,26 @@ class KeyPoseReadings:
             self.fraction[rows],
             self.field[rows],
             motion,
+        )
+
+    def checked(self) -> "KeyPoseReadings":
+        """Return a copy that is nobody else's.
+
+        Raises
+        ------
+        ValueError
+            An array has another shape or a number that is not finite; the line names it.
+        """
+        sensor = indices("sensor", self.sensor)
+        n = len(sensor)
+        return KeyPoseReadings(
+            indices("key_pose", self.key_pose, n),
+            sensor,
+            numbers("R_key_lidar", self.R_key_lidar, (n, 3, 3)),
+            numbers("p_key_lidar", self.p_key_lidar, (n, 3)),
+            numbers("fraction", self.fraction, (n,)),
+            numbers("field", self.field, (n, 3)),
+            None if self.motion is None else self.motion.checked(n),
         )
 
     def lidar_at(self, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -139,6 +160,30 @@ class Calibrations:
     def zeros(cls, sensors: int) -> "Calibrations":
         """Return room for so many sensors."""
         return cls(np.zeros((sensors, 3)), np.zeros((sensors, 12)), np.zeros(sensors))
+
+    def checked(self, sensor: npt.NDArray[np.int64]) -> "Calibrations":
+        """Return a copy that is nobody else's, of the sensors of some readings at least.
+
+        Parameters
+        ----------
+        sensor
+            Index of the sensor of each reading, shape (n,).
+
+        Raises
+        ------
+        ValueError
+            A sensor has no calibration, or an array has another shape or a number that is not
+            finite; the line names it.
+        """
+        S = len(self.t)
+        largest = int(sensor.max(initial=-1))
+        if largest >= S:
+            raise ValueError(f"sensor: {largest}; there are calibrations of {S} sensors, from 0")
+        return Calibrations(
+            numbers("Calibrations.t", self.t, (S, 3)),
+            numbers("Calibrations.distortion", self.distortion, (S, 12)),
+            numbers("Calibrations.offset", self.offset, (S,)),
+        )
 
 
 def key_pose_residuals(

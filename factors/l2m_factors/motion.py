@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from l2m_factors.arguments import numbers
 from l2m_factors.field_map import FloatArray
 
 
@@ -42,6 +43,11 @@ class PoseMotion:
         turn = rotation_matrices(-self._angle(offset))
         v = np.einsum("nij,nj->ni", turn, self.twist_lidar[:, 3:])
         return replace(self, twist_lidar=np.hstack([self.twist_lidar[:, :3], v]), offset=offset)
+
+    def checked(self, count: int) -> "PoseMotion":
+        """Return a copy of it at so many readings; a ValueError names an array that is wrong."""
+        twist = numbers("PoseMotion.twist_lidar", self.twist_lidar, (count, 6))
+        return PoseMotion(twist, numbers("PoseMotion.offset", self.offset, (count,)))
 
     def _angle(self, offset: FloatArray) -> FloatArray:
         return np.asarray(self.twist_lidar[:, :3] * (offset - self.offset)[:, None])

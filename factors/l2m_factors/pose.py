@@ -97,9 +97,16 @@ def key_pose_factor(
         What its readings share with others, as of ``uncertain_block_factor``.
     step
         What the error of the step to the next key pose adds to them; nothing without.
+
+    Raises
+    ------
+    ValueError
+        There are no readings on the key pose, or an array is of another number of readings.
     """
     rows = batch.rows_of(key_pose)
-    terms = [] if step is None else [step]
+    n = len(rows)
+    whitening, errors = whitening.checked(n), [each.checked(n) for each in errors]
+    terms = [] if step is None else [step.checked(n)]
     of_errors = [each.key for each in errors]
     of_steps = [key for each in terms for key in each.keys]
     slots = Slots([*batch.keys_of(key_pose), *of_errors, *of_steps])

@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 
+from l2m_factors.arguments import numbers
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.keys import D, T
 
@@ -24,8 +25,13 @@ def distortion_prior(sensor: int, C0: FloatArray, sigma: float) -> gtsam.CustomF
         Expected distortion matrix, shape (3, 3).
     sigma
         Standard deviation of each entry of C.
+
+    Raises
+    ------
+    ValueError
+        C0 has another shape or a number that is not finite.
     """
-    return _near(sensor, C0, gtsam.noiseModel.Isotropic.Sigma(9, sigma))
+    return _near(sensor, numbers("C0", C0, (3, 3)), gtsam.noiseModel.Isotropic.Sigma(9, sigma))
 
 
 def rotation_prior(
@@ -46,11 +52,17 @@ def rotation_prior(
         Standard deviation of each component of w in rad.
     stretch_sigma
         Standard deviation of each entry of E.
+
+    Raises
+    ------
+    ValueError
+        The rotation has another shape or a number that is not finite.
     """
-    turned = np.kron(np.eye(3), R_mag_lidar.T)  # C - R_mag_lidar from E + [w], row by row
+    R = numbers("R_mag_lidar", R_mag_lidar, (3, 3))
+    turned = np.kron(np.eye(3), R.T)  # C - R_mag_lidar from E + [w], row by row
     own = stretch_sigma**2 * np.eye(9) + turn_sigma**2 * TURNS @ TURNS.T
     noise = gtsam.noiseModel.Gaussian.Covariance(turned @ own @ turned.T)
-    return _near(sensor, R_mag_lidar, noise)
+    return _near(sensor, R, noise)
 
 
 def distance_prior(first: int, second: int, metres: float, sigma: float) -> gtsam.CustomFactor:
@@ -65,7 +77,14 @@ def distance_prior(first: int, second: int, metres: float, sigma: float) -> gtsa
         Indices of the sensors.
     metres, sigma
         The distance and its standard deviation.
+
+    Raises
+    ------
+    ValueError
+        Both are the same sensor.
     """
+    if first == second:
+        raise ValueError(f"second: {second} is the first, too; give two sensors")
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         apart = values.atPoint3(T(second)) - values.atPoint3(T(first))
@@ -106,8 +125,14 @@ def held_directions(sensor: int, directions: FloatArray, at: FloatArray) -> gtsa
         standard deviation, shape (K, 15).
     at
         The 15-vector at which they are held.
+
+    Raises
+    ------
+    ValueError
+        An array has another shape or a number that is not finite.
     """
-    start = directions @ at
+    directions = numbers("directions", directions, (len(directions), 15))
+    start = directions @ numbers("at", at, (15,))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         if jacobians is not None:

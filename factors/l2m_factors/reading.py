@@ -5,17 +5,33 @@ readings, made when the first factor of a linearisation asks and kept until a va
 """
 
 import struct
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from l2m_factors.arguments import index, noise_of, numbers, of_shape
 from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.keys import D, S, T
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
 
 Rows: TypeAlias = npt.NDArray[np.int64] | slice
+
+
+class ReadingEvaluation(NamedTuple):
+    """All residuals of a batch and the values they are of; stored at once, for several threads.
+
+    Attributes
+    ----------
+    seen
+        Of each sensor its values as bytes.
+    residuals
+        Of all readings.
+    """
+
+    seen: dict[int, bytes]
+    residuals: ReadingResiduals
 
 
 class BatchedReadings:
@@ -31,6 +47,12 @@ class BatchedReadings:
     distortion
         Fixed distortions (C row by row, H in uT), shape (S, 12). Without it the factors depend on
         ``D(i)``; they always do on ``T(i)``.
+
+    Raises
+    ------
+    ValueError
+        An array has another shape, a sensor no distortion, or a number is not finite: leave such a
+        reading out. The line names it.
     """
 
     def __init__(
@@ -40,13 +62,12 @@ class BatchedReadings:
         distortion: FloatArray | None = None,
     ) -> None:
         self._map = field_map
-        self._readings = readings
-        self._fixed = distortion
+        self._readings = readings = readings.checked()
+        self._fixed = None if distortion is None else _held(distortion, readings)
         self._sensors = [int(s) for s in np.unique(readings.sensor)]
         self._timed = readings.motion is not None
         self._keys = {s: self._variables(s) for s in self._sensors}
-        self._seen: dict[int, bytes] = {}
-        self._residuals: ReadingResiduals | None = None
+        self._last: ReadingEvaluation | None = None
         self._derived: tuple[ReadingResiduals, FloatArray] | None = None
 
     def __len__(self) -> int:
@@ -84,9 +105,10 @@ class BatchedReadings:
             These, if the caller knows them.
         """
         stamp = self.stamp(values, sensor) if stamp is None else stamp
-        if self._residuals is None or self._seen.get(sensor) != stamp:
-            self._residuals = self._evaluated(values)
-        return self._residuals
+        last = self._last
+        if last is None or last.seen.get(sensor) != stamp:
+            self._last = last = self._evaluated(values)
+        return last.residuals
 
     def jacobians(self, residuals: ReadingResiduals) -> list[FloatArray]:
         """Return the derivatives by each of ``keys_of``, each of shape (N, 3, .)."""
@@ -123,9 +145,11 @@ class BatchedReadings:
 
     def jacobian(self, residuals: ReadingResiduals) -> FloatArray:
         """Return the derivatives by all parameters of a sensor, shape (N, 3, sum of widths)."""
-        if self._derived is None or self._derived[0] is not residuals:
-            self._derived = residuals, np.concatenate(self.jacobians(residuals), axis=2)
-        return self._derived[1]
+        derived = self._derived
+        if derived is None or derived[0] is not residuals:
+            derived = residuals, np.concatenate(self.jacobians(residuals), axis=2)
+            self._derived = derived
+        return derived[1]
 
     def stamp(self, values: gtsam.Values, sensor: int) -> bytes:
         """Return the sensor's values as bytes, which compare faster than arrays.
@@ -142,7 +166,7 @@ class BatchedReadings:
         distortion = [D(sensor)] if self._fixed is None else []
         return [T(sensor), *distortion, *([S(sensor)] if self._timed else [])]
 
-    def _evaluated(self, values: gtsam.Values) -> ReadingResiduals:
+    def _evaluated(self, values: gtsam.Values) -> ReadingEvaluation:
         # A sensor without values, as when one factor is used alone, is evaluated at zero; nobody
         # asks for it, because its stamp is not kept.
         count = self._sensors[-1] + 1
@@ -155,8 +179,9 @@ class BatchedReadings:
                 distortion[sensor] = values.atVector(D(sensor))
             if offset is not None:
                 offset[sensor] = values.atDouble(S(sensor))
-        self._seen = {sensor: self.stamp(values, sensor) for sensor in present}
-        return reading_residuals(self._readings, self._map, t, distortion, offset)
+        seen = {sensor: self.stamp(values, sensor) for sensor in present}
+        found = reading_residuals(self._readings, self._map, t, distortion, offset)
+        return ReadingEvaluation(seen, found)
 
 
 def reading_factor(
@@ -172,8 +197,13 @@ def reading_factor(
         Index of the reading in the batch.
     noise_model
         Noise of its three axes in microtesla; any Gaussian or robust model.
+
+    Raises
+    ------
+    ValueError
+        The batch has no such reading, or the noise is not of three components.
     """
-    sensor = batch.sensor_of(reading)
+    sensor = batch.sensor_of(index("reading", reading, len(batch)))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, sensor)
@@ -182,7 +212,7 @@ def reading_factor(
                 jacobians[slot] = jacobian[reading]
         return np.asarray(residuals.residual[reading])
 
-    return gtsam.CustomFactor(noise_model, batch.keys_of(sensor), error)
+    return gtsam.CustomFactor(noise_of(noise_model, 3), batch.keys_of(sensor), error)
 
 
 def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> gtsam.CustomFactor:
@@ -197,9 +227,17 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
     whitening
         For each reading of the batch the matrix W that makes the noise of ``W e`` white with unit
         variance, in 1/uT, shape (N, 3, 3).
+
+    Raises
+    ------
+    ValueError
+        The sensor has no reading, or the whitening another shape.
     """
-    rows = _span(batch.rows_of(sensor))
-    W = whitening[rows]
+    own = batch.rows_of(sensor)
+    if not len(own):
+        raise ValueError(f"sensor: {sensor} has no reading; of {batch.sensors} there are some")
+    of_shape("whitening", whitening, (len(batch), 3, 3))
+    rows, W = _span(own), numbers("whitening", whitening[own], (len(own), 3, 3))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, sensor)
@@ -210,6 +248,15 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
 
     unit = gtsam.noiseModel.Unit.Create(3 * len(W))
     return gtsam.CustomFactor(unit, batch.keys_of(sensor), error)
+
+
+def _held(distortion: FloatArray, readings: MagneticReadings) -> FloatArray:
+    """Return a copy of fixed distortions, shape (S, 12)."""
+    S = len(distortion)
+    largest = int(readings.sensor.max(initial=-1))
+    if largest >= S:
+        raise ValueError(f"sensor: {largest}; there are distortions of {S} sensors, from 0")
+    return numbers("distortion", distortion, (S, 12))
 
 
 def _span(rows: npt.NDArray[np.int64]) -> Rows:

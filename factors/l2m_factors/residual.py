@@ -20,6 +20,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from l2m_factors.arguments import indices, numbers
 from l2m_factors.field_map import DifferentiableMap, FloatArray
 from l2m_factors.motion import PoseMotion, moved
 
@@ -50,6 +51,24 @@ class MagneticReadings:
 
     def __len__(self) -> int:
         return len(self.sensor)
+
+    def checked(self) -> "MagneticReadings":
+        """Return a copy that is nobody else's.
+
+        Raises
+        ------
+        ValueError
+            An array has another shape or a number that is not finite; the line names it.
+        """
+        sensor = indices("sensor", self.sensor)
+        n = len(sensor)
+        return MagneticReadings(
+            sensor,
+            numbers("R_map_lidar", self.R_map_lidar, (n, 3, 3)),
+            numbers("p_map_lidar", self.p_map_lidar, (n, 3)),
+            numbers("field", self.field, (n, 3)),
+            None if self.motion is None else self.motion.checked(n),
+        )
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from l2m_factors.arguments import index, indices, of_shape
 from l2m_factors.field_map import FloatArray, Jacobians
-from l2m_factors.keys import M, P
+from l2m_factors.keys import D, M, P
 from l2m_factors.reading import BatchedReadings
 
 POSE = 6  # rotation and translation
@@ -40,6 +41,16 @@ class SharedError:
 
     key: int
     features: FloatArray
+
+    def check(self, count: int) -> None:
+        """Raise a ValueError if it is not one of so many readings."""
+        name, size = gtsam.DefaultKeyFormatter(self.key), np.shape(self.features)[-1:]
+        of_shape(f"features of {name}", self.features, (count, 3, *size))
+
+    def checked(self, count: int) -> "SharedError":
+        """Return a copy for so many readings; a ValueError if it is of another number of them."""
+        self.check(count)
+        return SharedError(self.key, np.array(self.features, dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -74,12 +85,15 @@ class State(NamedTuple):
         Sum of the shared errors in the lidar frame in uT, shape (n, 3).
     residual
         ``e`` in uT, shape (n, 3).
+    white
+        ``W e``, shape (3 n,).
     """
 
     stamp: bytes
     C: FloatArray
     shared: FloatArray
     residual: FloatArray
+    white: FloatArray
 
 
 class UncertainReadings:
@@ -98,7 +112,14 @@ class UncertainReadings:
         What they share.
     whitening
         Matrix that makes the noise of ``W e`` white with unit variance, in 1/uT: one for each
-        reading, shape (n, 3, 3), or a lower triangular one for all of them, shape (3 n, 3 n).
+        reading, shape (n, 3, 3), or a lower triangular one for all of them, shape (3 n, 3 n). It
+        may be large and is not copied.
+
+    Raises
+    ------
+    ValueError
+        There is no reading or no error, readings are of several sensors, distortions are held in
+        the batch, or an array has another shape. The line says which.
     """
 
     def __init__(
@@ -108,7 +129,14 @@ class UncertainReadings:
         errors: Sequence[SharedError],
         whitening: FloatArray,
     ) -> None:
-        self.sensor = batch.sensor_of(int(rows[0]))
+        rows = indices("rows", rows)
+        self.sensor = _only_sensor(batch, rows)
+        n = len(rows)
+        of_shape("whitening", whitening, (3 * n, 3 * n) if np.ndim(whitening) == 2 else (n, 3, 3))
+        if not errors:
+            raise ValueError("errors: none; block_factor is for readings that share none")
+        for each in errors:
+            each.check(n)
         self.keys = [*batch.keys_of(self.sensor), *(each.key for each in errors)]
         self._batch, self._rows, self._W = batch, rows, whitening
         self._weights = [each.key for each in errors]
@@ -116,43 +144,44 @@ class UncertainReadings:
         widths = [each.features.shape[2] for each in errors]
         ends = np.cumsum([0, *batch.widths, *widths]).tolist()
         self._blocks = tuple(slice(*pair) for pair in pairwise(ends))
-        self._state = State(b"", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
-        self._white = np.empty(0)
-        self._linearised: WhiteRows | None = None
+        self._state: State | None = None
+        self._linearised: tuple[State, WhiteRows] | None = None
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def residual(self, values: gtsam.Values) -> FloatArray:
         """Return ``e`` in uT, shape (n, 3)."""
-        self.white_residual(values)
-        return self._state.residual
+        return self._state_at(values).residual
 
     def white_residual(self, values: gtsam.Values) -> FloatArray:
         """Return ``W e``, shape (3 n,), evaluated anew only if the values changed."""
-        own = self._batch.stamp(values, self.sensor)
-        weights = np.concatenate([values.atVector(key) for key in self._weights])
-        stamp = own + weights.tobytes()
-        if stamp != self._state.stamp:
-            C = np.frombuffer(own)[self._blocks[1]][:9].reshape(3, 3)
-            shared = self._features @ weights
-            e = self._batch.residuals(values, self.sensor, own).residual[self._rows] + shared @ C.T
-            self._state = State(stamp, C, shared, e)
-            self._white = whitened(self._W, e[:, :, None]).ravel()
-            self._linearised = None
-        return self._white
+        return self._state_at(values).white
 
     def linearised(self, values: gtsam.Values) -> WhiteRows:
         """Return residuals and derivatives, evaluated anew only if the values changed."""
-        white = self.white_residual(values)
-        if self._linearised is None:
-            jacobian = whitened(self._W, self._jacobian(values))
-            self._linearised = WhiteRows(white, jacobian, self._blocks)
-        return self._linearised
+        state, last = self._state_at(values), self._linearised
+        if last is None or last[0] is not state:
+            jacobian = whitened(self._W, self._jacobian(values, state))
+            self._linearised = last = state, WhiteRows(state.white, jacobian, self._blocks)
+        return last[1]
 
-    def _jacobian(self, values: gtsam.Values) -> FloatArray:
+    def _state_at(self, values: gtsam.Values) -> State:
+        """Return the last state, or that of changed values, kept for the next call."""
+        own, state = self._batch.stamp(values, self.sensor), self._state
+        weights = np.concatenate([values.atVector(key) for key in self._weights])
+        stamp = own + weights.tobytes()
+        if state is None or state.stamp != stamp:
+            C = np.frombuffer(own)[self._blocks[1]][:9].reshape(3, 3)
+            shared = self._features @ weights
+            e = self._batch.residuals(values, self.sensor, own).residual[self._rows] + shared @ C.T
+            state = State(stamp, C, shared, e, whitened(self._W, e[:, :, None]).ravel())
+            self._state, self._linearised = state, None
+        return state
+
+    def _jacobian(self, values: gtsam.Values, state: State) -> FloatArray:
         """Return derivatives by all variables, shape (n, 3, k), where the residual was taken."""
-        state, by_C = self._state, self._blocks[1].start
+        by_C = self._blocks[1].start
         own = self._batch.jacobian(self._batch.residuals(values, self.sensor))
         J = np.empty((len(self), 3, self._blocks[-1].stop))
         J[:, :, : own.shape[2]] = own[self._rows]
@@ -190,7 +219,13 @@ def uncertain_reading_factor(readings: UncertainReadings, reading: int) -> gtsam
         Those that share errors.
     reading
         Which of them, from 0.
+
+    Raises
+    ------
+    ValueError
+        There is no such reading.
     """
+    index("reading", reading, len(readings))
     own = slice(3 * reading, 3 * reading + 3)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
@@ -201,6 +236,19 @@ def uncertain_reading_factor(readings: UncertainReadings, reading: int) -> gtsam
         return found.residual[own]
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), readings.keys, error)
+
+
+def _only_sensor(batch: BatchedReadings, rows: npt.NDArray[np.int64]) -> int:
+    """Return the sensor of all these readings, whose distortion must be a variable."""
+    if not len(rows):
+        raise ValueError("rows: none; at least one reading is needed")
+    sensors = sorted({batch.sensor_of(index("rows", row, len(batch))) for row in rows.tolist()})
+    if len(sensors) > 1:
+        raise ValueError(f"rows: of sensors {sensors}; make UncertainReadings of each sensor")
+    if D(sensors[0]) not in batch.keys_of(sensors[0]):
+        name = f"D{sensors[0]}"
+        raise ValueError(f"batch: its distortions are held; leave them out, with a prior on {name}")
+    return sensors[0]
 
 
 def shared_error(errors: Sequence[SharedError], values: gtsam.Values) -> FloatArray:
@@ -225,8 +273,15 @@ def map_weights_prior(sizes: Mapping[int, int], root_information: FloatArray) ->
         Number of weights of each tile, by its index.
     root_information
         Matrix R with ``R^T R`` the inverse of their covariance, columns tile by tile in the order
-        of ``sizes``, shape (K, K).
+        of ``sizes``, shape (K, K). It may be large and is not copied.
+
+    Raises
+    ------
+    ValueError
+        It has another shape.
     """
+    whole = sum(sizes.values())
+    of_shape("root_information", root_information, (whole, whole))
     ends = np.cumsum(list(sizes.values()))
     blocks = np.split(root_information, ends[:-1], axis=1)
 
@@ -255,8 +310,14 @@ def map_weights_information(
         As of ``map_weights_prior``.
     information
         Inverse of the covariance; its lower triangle is enough, shape (K, K).
+
+    Raises
+    ------
+    ValueError
+        It has another shape.
     """
     ends = np.cumsum([0, *sizes.values()]).tolist()
+    of_shape("information", information, (ends[-1], ends[-1]))
     at = {tile: slice(*pair) for tile, pair in zip(sizes, pairwise(ends), strict=True)}
     nothing = {tile: (np.zeros((size, size)), np.zeros(size)) for tile, size in sizes.items()}
     pairs, zero = gtsam.GaussianFactorGraph(), gtsam.Values()
@@ -279,7 +340,15 @@ def pose_errors_prior(correlation: Sequence[float]) -> gtsam.NonlinearFactorGrap
     ----------
     correlation
         Between each knot and the next, 0 to 1 (excluded); there is one knot more.
+
+    Raises
+    ------
+    ValueError
+        A correlation is not in that range.
     """
+    for knot, like in enumerate(correlation):
+        if not 0 <= like < 1:
+            raise ValueError(f"correlation: {like:g} of knot {knot}; needed is 0 to 1 (excluded)")
     graph = gtsam.NonlinearFactorGraph()
     unit = gtsam.noiseModel.Unit.Create(POSE)
     graph.add(gtsam.PriorFactorVector(P(0), np.zeros(POSE), unit))

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from l2m_factors.arguments import numbers
 from l2m_factors.field_map import FloatArray
 from l2m_factors.keys import N
 
@@ -42,6 +43,10 @@ class SlowError:
 
     key_pose: int
     shares: FloatArray
+
+    def checked(self, count: int) -> "SlowError":
+        """Return a copy for so many readings; a ValueError if it is of another number of them."""
+        return SlowError(self.key_pose, numbers("SlowError.shares", self.shares, (count, 2)))
 
     @property
     def keys(self) -> list[int]:

@@ -16,6 +16,7 @@ and with the turn R and the way d along the axes of the frame of the poses
 import gtsam
 import numpy as np
 
+from l2m_factors.arguments import numbers
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.fixed_axes_step import fixed_axes_residual
 from l2m_factors.joint_residual import Residual
@@ -68,8 +69,13 @@ def drifting_fixed_axes_step(
         As of ``fixed_axes_step_factor``; the way is with the drift.
     weights
         As of ``drifting_step``.
+
+    Raises
+    ------
+    ValueError
+        The way is not of three finite numbers.
     """
-    W = drift_weights(weights)
+    W, way = drift_weights(weights), numbers("way", way, (3,))
 
     def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         poses = [values.atPose3(X(key_pose + end)) for end in (0, 1)]

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from l2m_factors.arguments import noise_of, numbers
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.keys import G, X
 from l2m_factors.whitening import Whitening
@@ -37,6 +38,11 @@ class StepError:
     key_pose: int
     step: gtsam.Pose3
     slope: FloatArray
+
+    def checked(self, count: int) -> "StepError":
+        """Return a copy for so many readings; a ValueError if it is of another number of them."""
+        slope = numbers("StepError.slope", self.slope, (count, 3, 6))
+        return StepError(self.key_pose, self.step, slope)
 
     @property
     def keys(self) -> list[int]:
@@ -98,6 +104,11 @@ def scaled_step_factor(
     noise
         Of a right perturbation of the step, rotation (rad) before translation (m), beside what the
         share does.
+
+    Raises
+    ------
+    ValueError
+        The noise is not of six components.
     """
     R, p = step.rotation(), step.translation()
     by_share = np.append(np.zeros(3), R.matrix().T @ p)  # as a right perturbation of Z
@@ -113,4 +124,4 @@ def scaled_step_factor(
             jacobians[2] = -(by_off @ (off.inverse().AdjointMap() @ by_share))[:, None]
         return np.asarray(gtsam.Pose3.Logmap(off))
 
-    return gtsam.CustomFactor(noise, [X(key_pose), X(key_pose + 1), G()], error)
+    return gtsam.CustomFactor(noise_of(noise, 6), [X(key_pose), X(key_pose + 1), G()], error)

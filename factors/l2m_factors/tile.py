@@ -100,7 +100,7 @@ class TilePlaces:
 
 
 class TileBatch(KeyPoseBatch):
-    """Readings on key poses in one tile.
+    """Readings on key poses in one tile, for one thread at a time.
 
     Parameters
     ----------
@@ -155,12 +155,13 @@ class TileBatch(KeyPoseBatch):
         """Return where the readings on a key pose are, without a query of the field."""
         stamp = self._stamp(values, key_pose)
         if self._places is None or self._placed.get(key_pose) != stamp:
-            if self._seen.get(key_pose) == stamp:
-                point, self._placed = self._point, self._seen
+            last = self._last
+            if last is not None and last.seen.get(key_pose) == stamp:
+                point, self._placed = self._point, last.seen
             else:
-                present = [k for k in self._rows if self._is_present(values, k)]
+                present = self._present(values)
                 point = self._evaluation_point(values, present)
-                self._placed = {k: self._stamp(values, k) for k in present}
+                self._placed = self._stamps(values, present)
             self._places = self._places_at(*point)
         return self._places[self._rows[key_pose]]
 
@@ -215,7 +216,9 @@ class TileBatch(KeyPoseBatch):
         return values.atPose3(X(self._anchor)).between(values.atPose3(X(key_pose)))
 
     def _is_present(self, values: gtsam.Values, key_pose: int) -> bool:
-        return key_pose == self._anchor or bool(values.exists(X(key_pose)))
+        if key_pose == self._anchor:
+            return True
+        return bool(values.exists(X(self._anchor)) and values.exists(X(key_pose)))
 
     def _field(self, values: gtsam.Values) -> DifferentiableMap:
         return WeightedField(self._tile, values.atVector(M(self._number)))
@@ -265,9 +268,15 @@ def tile_residual(
         What the error of the step to the next key pose adds to them; nothing without.
     slow
         What they have of a slow error of their sensor; nothing without.
+
+    Raises
+    ------
+    ValueError
+        There are no readings on the key pose, or an array is of another number of readings.
     """
     rows = batch.rows_of(key_pose)
-    terms = [each for each in (step, slow) if each is not None]
+    whitening = whitening.checked(len(rows))
+    terms = [each.checked(len(rows)) for each in (step, slow) if each is not None]
     slots = Slots([*batch.keys_of(key_pose), *(key for each in terms for key in each.keys)])
 
     def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:

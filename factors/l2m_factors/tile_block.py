@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from l2m_factors.arguments import numbers
 from l2m_factors.complexity import ComplexityPenalty
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.joint_residual import Residual
@@ -103,7 +104,7 @@ def run_of(numbers: npt.NDArray[np.int64], number: int) -> slice:
 
 
 class TileBlocks(TileBatch):
-    """Readings on key poses in one tile, each with noise of its own.
+    """Readings on key poses in one tile, each with noise of its own, for one thread at a time.
 
     Parameters
     ----------
@@ -111,6 +112,11 @@ class TileBlocks(TileBatch):
         As of ``TileBatch``.
     whitening
         Of each of N readings, 1/uT, shape (N, 3, 3).
+
+    Raises
+    ------
+    ValueError
+        As of ``TileBatch``, or the whitening is of another number of readings.
     """
 
     def __init__(
@@ -123,11 +129,10 @@ class TileBlocks(TileBatch):
         fixed: Calibrations | None = None,
     ) -> None:
         super().__init__(number, anchor, field, readings, fixed)
-        self._W = whitening
+        self._W = numbers("whitening", whitening, (len(readings), 3, 3))
         self._on_anchor = self._rows.get(anchor, np.empty(0, dtype=np.int64))
-        every_sensor = self._variables.on(np.arange(len(readings)))
         poses = [X(k) for k in dict.fromkeys([*self._rows, anchor])]
-        self._every_key = [*poses, M(number), *self._variables.keys(every_sensor)]
+        self._every_key = [*poses, M(number), *self._variables.keys(self._every_sensor)]
         self._evaluated_at = gtsam.Values()
         self._found: KeyPoseResiduals
         self._white: FloatArray
@@ -204,8 +209,7 @@ class TileBlocks(TileBatch):
         at = self._own_values(values)
         if at.equals(self._evaluated_at, 0.0):
             return
-        present = [k for k in self._rows if self._is_present(values, k)]
-        self._found = self._evaluated(values, present)
+        self._found = self._evaluated(values, self._present(values))
         self._where = self._places_at(*self._point)
         self._white = np.einsum("nij,nj->ni", self._W, self._found.reading.residual)
         self._of_readings = self._of_places = None

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l2m_factors.arguments import numbers
 from l2m_factors.field_map import FloatArray
 
 NOTHING = 1e-3  # of a variance: a smaller part of it changes no sigma noticeably
@@ -53,6 +54,20 @@ class Whitening:
         informative = values > NOTHING
         values, vectors = values[informative], vectors[:, informative]
         return cls(own, A @ (vectors * np.sqrt((1 - 1 / np.sqrt(1 + values)) / values)))
+
+    def checked(self, count: int) -> "Whitening":
+        """Return a copy for so many readings that is nobody else's.
+
+        Raises
+        ------
+        ValueError
+            It is of another number of readings, or has a number that is not finite.
+        """
+        r = np.shape(self.common)[-1:]
+        return Whitening(
+            numbers("Whitening.own", self.own, (count, 3, 3)),
+            numbers("Whitening.common", self.common, (3 * count, *r)),
+        )
 
     def __call__(self, block: FloatArray) -> FloatArray:
         """Return residuals or derivatives of n readings, (n, 3, k), white and in rows, (3 n, k)."""

@@ -43,7 +43,7 @@ def drive(
     frame: str = "map",
     pose_covariance: npt.ArrayLike | None = None,
 ) -> Recording:
-    """Return a drive, or a survey, made of arrays.
+    """Return a drive, or a survey, made of copies of arrays.
 
     Parameters
     ----------
@@ -225,7 +225,8 @@ def _stamps(name: str, values: npt.ArrayLike) -> IntArray:
 def _numbers(
     name: str, values: npt.ArrayLike, shape: tuple[int, ...], *, finite: bool = True
 ) -> FloatArray:
-    array = array_of(name, values)
+    """Return a copy, which does not change when its owner writes into the array."""
+    array = array_of(name, values).copy()
     if array.shape != shape:
         raise InputError(f"{name}: of shape {array.shape}; needed is {shape}")
     if finite and not np.isfinite(array).all():
@@ -252,7 +253,7 @@ def _covariance(values: npt.ArrayLike, count: int) -> FloatArray | None:
     symmetric = np.abs(found - found.swapaxes(1, 2)) <= 1e-9 * largest
     if not symmetric.all() or np.linalg.eigvalsh(found / largest).min() < -1e-9:
         raise InputError("pose_covariance: must be symmetric, without negative eigenvalues")
-    return found.copy()
+    return found
 
 
 def _rotations(values: npt.ArrayLike, count: int) -> FloatArray:

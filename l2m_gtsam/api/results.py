@@ -1,7 +1,7 @@
 """Results for those who work with them in Python: plain values, tables, and HTML for notebooks."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -70,7 +70,8 @@ class JudgedCalibration(Shown):
     Attributes
     ----------
     result
-        The calibration; `calibration["name"]` is one of its sensors.
+        The calibration; `calibration["name"]` is one of its sensors, and `list(calibration)` are
+        their names.
     verdict
         PASS, WARN or FAIL, with reasons.
     """
@@ -80,6 +81,12 @@ class JudgedCalibration(Shown):
 
     def __getitem__(self, sensor: str) -> SensorCalibration:
         return self.result[sensor]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.result)
+
+    def __contains__(self, sensor: object) -> bool:
+        return sensor in self.result
 
     def heading(self) -> str:
         """Return the verdict."""

@@ -14,7 +14,7 @@ from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
-from l2m_gtsam.errors import NoSuchNameError
+from l2m_gtsam.records.by_sensor import BySensor
 from l2m_gtsam.records.error_budget import (
     EXPLAINED,
     Disturbance,
@@ -364,7 +364,7 @@ class SensorCalibration:
 
 
 @dataclass(frozen=True)
-class CalibrationResult:
+class CalibrationResult(BySensor[SensorCalibration]):
     """The outcome of one calibration run over all sensors.
 
     Attributes
@@ -453,9 +453,3 @@ class CalibrationResult:
         if self.map_origin is None or not self.recorded:
             return None
         return self.map_origin.age_days(self.recorded[0].when)
-
-    def __getitem__(self, sensor: str) -> SensorCalibration:
-        for entry in self.sensors:
-            if entry.sensor == sensor:
-                return entry
-        raise NoSuchNameError.of(sensor, (entry.sensor for entry in self.sensors))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.errors import NoSuchNameError
+from l2m_gtsam.records.by_sensor import BySensor
 from l2m_gtsam.records.calibration import Uncertainty
 
 
@@ -95,7 +95,7 @@ class MotionPlan:
 
 
 @dataclass(frozen=True)
-class DrivePlan:
+class DrivePlan(BySensor[SensorPlan]):
     """What a drive will determine and what would help.
 
     Attributes
@@ -121,9 +121,3 @@ class DrivePlan:
     worst: Worst
     motions: tuple[MotionPlan, ...]
     doubts: tuple[str, ...]
-
-    def __getitem__(self, sensor: str) -> SensorPlan:
-        for entry in self.sensors:
-            if entry.sensor == sensor:
-                return entry
-        raise NoSuchNameError.of(sensor, (entry.sensor for entry in self.sensors))

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import AliasChoices, Field
 
-from l2m_gtsam.errors import NoSuchNameError
+from l2m_gtsam.records.by_sensor import BySensor
 from l2m_gtsam.records.record import Record
 
 
@@ -66,7 +66,7 @@ class SensorVerdict(Record):
 
 
 @dataclass(frozen=True)
-class Verdict(Record):
+class Verdict(Record, BySensor[SensorVerdict]):
     """The verdict on a whole.
 
     Attributes
@@ -115,12 +115,6 @@ class Verdict(Record):
             each.level is worst(reason.level for reason in each.reasons) for each in self.sensors
         )
         return self.level is worst([own, *(s.level for s in self.sensors)]) and all(each_follows)
-
-    def __getitem__(self, sensor: str) -> SensorVerdict:
-        for each in self.sensors:
-            if each.sensor == sensor:
-                return each
-        raise NoSuchNameError.of(sensor, (each.sensor for each in self.sensors))
 
     def count(self, level: Level) -> int:
         """Return the number of sensors with this verdict."""

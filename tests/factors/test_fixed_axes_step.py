@@ -2,6 +2,7 @@
 
 import gtsam
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -37,3 +38,17 @@ def test_an_error_of_the_attitude_turns_no_step(seed: int) -> None:
         values.insert(X(k), gtsam.Pose3(pose.rotation().compose(wrong), pose.translation()))
     factor = fixed_axes_step_factor(0, turn, way, NOISE)
     np.testing.assert_allclose(factor.unwhitenedError(values), 0.0, atol=1e-9)
+
+
+def test_the_way_is_kept_and_wrong_arguments_are_refused() -> None:
+    way, turn, values = np.ones(3), gtsam.Rot3(), gtsam.Values()
+    for k, pose in enumerate(poses(3)):
+        values.insert(X(k), pose)
+    factor = fixed_axes_step_factor(0, turn, way, NOISE)
+    before = factor.error(values)
+    way[:] = 0
+    assert factor.error(values) == before
+    with pytest.raises(ValueError, match=r"^way: of shape \(2,\); needed is \(3,\)$"):
+        fixed_axes_step_factor(0, turn, np.ones(2), NOISE)
+    with pytest.raises(ValueError, match=r"^noise: of dimension 3; needed is 6$"):
+        fixed_axes_step_factor(0, turn, way, gtsam.noiseModel.Unit.Create(3))

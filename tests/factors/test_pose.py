@@ -1,6 +1,9 @@
 """Readings on poses that are variables: derivatives on the manifold, batching, and agreement."""
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -187,6 +190,99 @@ def test_a_factor_alone_needs_only_its_own_variables() -> None:
     W = whitenings(5, len(mine))
     alone = key_pose_factor(MapBatch(dipole_world(5), mine), 1, W)
     assert key_pose_factor(batch, 1, W).error(values) == pytest.approx(alone.error(everything))
+
+
+def test_arrays_that_are_written_into_later_change_no_batch() -> None:
+    values, readings = values_for(8), random_carried(8)
+    fixed = calibrations(values)
+    batch, world = MapBatch(dipole_world(8), readings, fixed), dipole_world(8)
+    expected = MapBatch(world, readings, fixed).residuals(values, 0).reading.residual
+    for array in (readings.field, readings.p_key_lidar, readings.sensor, fixed.t, fixed.distortion):
+        array[:] = 0
+    found = batch.residuals(values, 0).reading.residual
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "of", "line"),
+    [
+        ("field", lambda field: field[:1], r"field: of shape \(1, 3\); needed is \(8, 3\)"),
+        ("field", lambda field: np.nan * field, "field: row 0 is not finite"),
+        ("key_pose", lambda key_pose: key_pose[:1], r"key_pose: of shape \(1,\); needed is \(8,\)"),
+        ("sensor", lambda sensor: sensor + 1, "sensor: 2; there are calibrations of 2 sensors"),
+    ],
+)
+def test_a_batch_of_wrong_readings_is_refused(
+    name: str, of: Callable[[Any], Any], line: str
+) -> None:
+    readings = random_carried(8)
+    change: dict[str, Any] = {name: of(getattr(readings, name))}
+    wrong = replace(readings, **change)
+    with pytest.raises(ValueError, match=line):
+        MapBatch(dipole_world(8), wrong, calibrations(values_for(8)))
+
+
+def test_arrays_that_are_written_into_later_change_no_factor() -> None:
+    values, readings = values_for(8, 3), random_carried(8)
+    W, step = whitenings(8, 4), step_error(8, 4, values)
+    shared = SharedError(M(7), np.ones((4, 3, MODES)))
+    batch = MapBatch(dipole_world(8), readings)
+    factor = key_pose_factor(batch, 1, W, [shared], step)
+    before = factor.error(values)
+    for array in (W.own, W.common, step.slope, shared.features):
+        array[:] = 0
+        assert factor.error(values) == before
+
+
+def test_a_factor_of_wrong_arguments_is_refused_in_one_line() -> None:
+    values, W = values_for(8, 3), whitenings(8, 4)
+    batch = MapBatch(dipole_world(8), random_carried(8))
+    flat, off = Whitening(W.own[0], W.common), step_error(8, 1, values)
+    for k, white, step, line in (
+        (7, W, None, "key_pose: 7 has no readings; see key_poses of the batch"),
+        (1, whitenings(8, 3), None, "Whitening.own: of shape (3, 3, 3); needed is (4, 3, 3)"),
+        (1, flat, None, "Whitening.own: of shape (3, 3); needed is (4, 3, 3)"),
+        (1, W, off, "StepError.slope: of shape (1, 3, 6); needed is (4, 3, 6)"),
+    ):
+        with pytest.raises(ValueError, match=f"^{re.escape(line)}$"):
+            key_pose_factor(batch, k, white, step=step)
+
+
+class Interrupted(MapBatch):
+    """A batch that another thread asks for other values while it stamps what it has evaluated."""
+
+    between: list[gtsam.Values]
+
+    def _stamps(self, values: gtsam.Values, present: list[int]) -> dict[int, bytes]:
+        if self.between:
+            self.residuals(self.between.pop(), 0)
+        return super()._stamps(values, present)
+
+
+def test_two_threads_get_their_own_residuals() -> None:
+    one, other = values_for(8), values_for(9)
+    world, readings = dipole_world(8), random_carried(8)
+    batch = Interrupted(world, readings)
+    batch.between = [other]
+    for values in (one, other, one):
+        alone = MapBatch(world, readings).residuals(values, 0).reading.residual
+        np.testing.assert_array_equal(batch.residuals(values, 0).reading.residual, alone)
+
+
+def test_a_sensor_that_comes_later_is_not_asked_for() -> None:
+    """On line, values have all key poses so far, but no calibration of a sensor yet to come."""
+    everything, readings = values_for(5), random_carried(5)
+    readings = replace(readings, sensor=readings.key_pose)
+    values = gtsam.Values()
+    for key in (X(0), X(1)):
+        values.insert(key, everything.atPose3(key))
+    values.insert(T(0), everything.atPoint3(T(0)))
+    values.insert(D(0), everything.atVector(D(0)))
+    world, W = dipole_world(5), whitenings(5, 4)
+    alone = key_pose_factor(MapBatch(world, on(readings, 0)), 0, W)
+    factor = key_pose_factor(MapBatch(world, readings), 0, W)
+    assert factor.error(values) == pytest.approx(alone.error(values))
+    assert_jacobians_match(factor, values)
 
 
 def test_a_reading_pulls_its_pose_back() -> None:

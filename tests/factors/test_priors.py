@@ -1,5 +1,8 @@
 """Priors as factors: exact Jacobians, and errors and covariances in closed form."""
 
+import re
+from collections.abc import Callable
+
 import gtsam
 import numpy as np
 import pytest
@@ -7,7 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import D, T, assert_jacobians_match, distance_prior, rotation_prior
+from l2m_factors import (
+    D,
+    T,
+    assert_jacobians_match,
+    distance_prior,
+    distortion_prior,
+    held_directions,
+    map_weights_information,
+    map_weights_prior,
+    pose_errors_prior,
+    rotation_prior,
+)
 from l2m_gtsam.data import FloatArray
 
 SEEDS = st.integers(0, 1000)
@@ -78,3 +92,46 @@ def test_two_sensors_at_one_point_have_a_finite_distance() -> None:
     )
     np.testing.assert_array_equal(jacobian, np.zeros((1, 6)))
     assert b == pytest.approx([50.0])
+
+
+def test_wrong_priors_are_refused_in_one_line() -> None:
+    wrong: tuple[tuple[Callable[[], object], str], ...] = (
+        (lambda: distance_prior(1, 1, 0.5, 0.1), "second: 1 is the first, too; give two sensors"),
+        (
+            lambda: distortion_prior(0, np.ones(9), 0.1),
+            "C0: of shape (9,); needed is (3, 3)",
+        ),
+        (
+            lambda: rotation_prior(0, np.ones(9), 0.1, 0.1),
+            "R_mag_lidar: of shape (9,); needed is (3, 3)",
+        ),
+        (
+            lambda: held_directions(0, np.ones((2, 12)), np.ones(15)),
+            "directions: of shape (2, 12); needed is (2, 15)",
+        ),
+        (
+            lambda: pose_errors_prior([0.5, 1.0]),
+            "correlation: 1 of knot 1; needed is 0 to 1 (excluded)",
+        ),
+        (
+            lambda: map_weights_prior({3: 2, 5: 1}, np.eye(2)),
+            "root_information: of shape (2, 2); needed is (3, 3)",
+        ),
+        (
+            lambda: map_weights_information({3: 2, 5: 1}, np.eye(2)),
+            "information: of shape (2, 2); needed is (3, 3)",
+        ),
+    )
+    for made, line in wrong:
+        with pytest.raises(ValueError, match=f"^{re.escape(line)}$"):
+            made()
+
+
+def test_arrays_that_are_written_into_later_change_no_prior() -> None:
+    C0, directions, values = np.eye(3), np.ones((1, 15)), gtsam.Values()
+    values.insert(T(0), np.ones(3))
+    values.insert(D(0), np.ones(12))
+    priors = (distortion_prior(0, C0, 0.1), held_directions(0, directions, np.zeros(15)))
+    before = [prior.error(values) for prior in priors]
+    C0[:], directions[:] = 0.0, 0.0
+    assert [prior.error(values) for prior in priors] == before

@@ -1,5 +1,7 @@
 """The magnetic reading factors: derivatives, batching, and the two forms of one mathematics."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -168,6 +170,67 @@ def test_blocks_equal_readings() -> None:
         np.testing.assert_allclose(a.atPoint3(T(i)), b.atPoint3(T(i)), atol=1e-7)
         np.testing.assert_allclose(a.atVector(D(i)), b.atVector(D(i)), atol=1e-6)
         assert np.linalg.norm(a.atPoint3(T(i)) - sensors[i].t_lidar_mag) < 0.02
+
+
+def test_arrays_that_are_written_into_later_change_nothing() -> None:
+    world, values = dipole_world(4), random_values(4, 2)
+    held = fixed_distortion(values, 2)
+    readings = as_magnetic(drive(4, random_sensors(4, 2), world, count=3))
+    W = np.tile(np.eye(3), (6, 1, 1))
+    factor = block_factor(BatchedReadings(world, readings, held), 1, W)
+    again = BatchedReadings(world, readings, held)
+    expected = again.residuals(values, 1).residual[again.rows_of(1)].ravel()
+    for array in (W, held, readings.sensor, readings.field, readings.p_map_lidar):
+        array[:] = 0
+    np.testing.assert_array_equal(factor.unwhitenedError(values), expected)
+
+
+def test_wrong_arguments_are_refused_in_one_line() -> None:
+    world = dipole_world(4)
+    readings = as_magnetic(drive(4, random_sensors(4, 2), world, count=3))
+    motion = PoseMotion(np.ones((6, 6)), np.zeros(1))
+    unit, batch = gtsam.noiseModel.Unit.Create, BatchedReadings(world, readings)
+    for reading in (-1, 6):
+        with pytest.raises(ValueError, match=f"^reading: {reading}; there are 6, from 0$"):
+            reading_factor(batch, reading, unit(3))
+    with pytest.raises(ValueError, match=r"^noise: of dimension 6; needed is 3$"):
+        reading_factor(batch, 0, unit(6))
+    with pytest.raises(ValueError, match=r"^sensor: 2 has no reading; of \[0, 1\] there are some$"):
+        block_factor(batch, 2, np.ones((6, 3, 3)))
+    with pytest.raises(
+        ValueError, match=r"^whitening: of shape \(3, 3, 3\); needed is \(6, 3, 3\)$"
+    ):
+        block_factor(batch, 1, np.ones((3, 3, 3)))
+    with pytest.raises(ValueError, match=r"^field: of shape \(1, 3\); needed is \(6, 3\)$"):
+        BatchedReadings(world, replace(readings, field=readings.field[:1]))
+    with pytest.raises(ValueError, match=r"^PoseMotion.offset: of shape \(1,\); needed is \(6,\)$"):
+        BatchedReadings(world, replace(readings, motion=motion))
+    with pytest.raises(
+        ValueError, match=r"^sensor: 1; there are distortions of 1 sensors, from 0$"
+    ):
+        BatchedReadings(world, readings, np.ones((1, 12)))
+
+
+class InterruptedWorld(CountingWorld):
+    """A map during whose query another thread asks the same batch for other values."""
+
+    batch: BatchedReadings
+    between: list[gtsam.Values]
+
+    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if self.between:
+            self.batch.residuals(self.between.pop(), 0)
+        return super().field_and_gradient(points)
+
+
+def test_two_threads_get_their_own_residuals() -> None:
+    one, other, plain = random_values(8, 2), random_values(9, 2), dipole_world(8)
+    readings = as_magnetic(drive(8, random_sensors(8, 2), plain, count=4))
+    world = InterruptedWorld(plain)
+    world.batch, world.between = BatchedReadings(world, readings), [other]
+    for values in (one, other, one):
+        alone = BatchedReadings(plain, readings).residuals(values, 0).residual
+        np.testing.assert_array_equal(world.batch.residuals(values, 0).residual, alone)
 
 
 def test_a_pose_moves_as_its_twist_says() -> None:

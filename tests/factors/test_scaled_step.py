@@ -2,6 +2,7 @@
 
 import gtsam
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -37,3 +38,8 @@ def test_a_known_scale_makes_it_a_step_that_is_longer(seed: int, longer: float) 
         ours.unwhitenedError(values), plain.unwhitenedError(values), atol=1e-9
     )
     assert np.isclose(ours.error(values), plain.error(values), rtol=1e-9, atol=1e-9)
+
+
+def test_noise_of_another_dimension_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^noise: of dimension 3; needed is 6$"):
+        scaled_step_factor(4, gtsam.Pose3(), gtsam.noiseModel.Unit.Create(3))

@@ -1,5 +1,6 @@
 """Readings that share errors of map and poses: derivatives, and none as a special case."""
 
+import re
 from dataclasses import replace
 
 import gtsam
@@ -14,6 +15,7 @@ from l2m_factors import (
     M,
     MagneticReadings,
     P,
+    ReadingResiduals,
     SharedError,
     UncertainReadings,
     assert_jacobians_match,
@@ -158,6 +160,70 @@ def test_a_factor_for_each_reading_is_as_good_as_one_for_all(dense: bool) -> Non
         np.testing.assert_array_equal(np.concatenate([part[0] for part in parts]), J)
         np.testing.assert_array_equal(np.concatenate([part[1] for part in parts]), b)
         assert sum(factor.error(at) for factor in each) == pytest.approx(0.5 * b @ b, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rows", "errors", "length", "line"),
+    [
+        ([4, 5], 2, 2, "rows: of sensors [0, 1]; make UncertainReadings of each sensor"),
+        ([], 0, 0, "rows: none; at least one reading is needed"),
+        ([9, 10], 2, 2, "rows: 10; there are 10, from 0"),
+        ([5, 6], None, 2, "errors: none; block_factor is for readings that share none"),
+        ([5, 6], 3, 2, "features of M7: of shape (3, 3, 4); needed is (2, 3, 4)"),
+        ([5, 6], 2, 3, "whitening: of shape (3, 3, 3); needed is (2, 3, 3)"),
+    ],
+)
+def test_wrong_readings_are_refused_in_one_line(
+    rows: list[int], errors: int | None, length: int, line: str
+) -> None:
+    batch = BatchedReadings(world := dipole_world(2), some_readings(2, world))
+    shared = [] if errors is None else in_tile(7, features(2, errors, 4))
+    with pytest.raises(ValueError, match=f"^{re.escape(line)}$"):
+        UncertainReadings(batch, np.array(rows, dtype=np.int64), shared, whitenings(2, length))
+
+
+def test_distortions_that_are_held_are_refused_in_one_line() -> None:
+    world, held = dipole_world(2), np.ones((2, 12))
+    batch, errors = BatchedReadings(world, some_readings(2, world), held), features(2, 2, 4)
+    with pytest.raises(ValueError, match=r"^batch: its distortions are held; leave them out, with"):
+        UncertainReadings(batch, np.array([5, 6]), in_tile(7, errors), whitenings(2, 2))
+
+
+def test_a_reading_that_is_none_of_them_is_refused() -> None:
+    batch = BatchedReadings(world := dipole_world(2), some_readings(2, world))
+    rows, errors = np.array([5, 6]), in_tile(7, features(2, 2, 4))
+    group = UncertainReadings(batch, rows, errors, whitenings(2, 2))
+    rows[:] = 0  # it keeps its own
+    values = with_weights(2, 2)
+    expected = UncertainReadings(batch, np.array([5, 6]), errors, whitenings(2, 2))
+    np.testing.assert_array_equal(group.residual(values), expected.residual(values))
+    with pytest.raises(ValueError, match=r"^reading: -1; there are 2, from 0$"):
+        uncertain_reading_factor(group, -1)
+
+
+class Interrupted(BatchedReadings):
+    """A batch during whose derivatives another thread asks the readings for other values."""
+
+    group: UncertainReadings
+    between: list[gtsam.Values]
+
+    def jacobian(self, residuals: ReadingResiduals) -> FloatArray:
+        if self.between:
+            self.group.white_residual(self.between.pop())
+        return super().jacobian(residuals)
+
+
+def test_two_threads_get_their_own_rows() -> None:
+    one, other, world = with_weights(2, 2), with_weights(3, 2), dipole_world(2)
+    rows, errors, W = np.arange(5, 8), in_tile(7, features(2, 3, 4)), whitenings(2, 3)
+    batch = Interrupted(world, some_readings(2, world))
+    batch.between, batch.group = [other], UncertainReadings(batch, rows, errors, W)
+    plain = BatchedReadings(world, some_readings(2, world))
+    for values in (one, other, one):
+        alone = UncertainReadings(plain, rows, errors, W).linearised(values)
+        found = batch.group.linearised(values)
+        np.testing.assert_array_equal(found.residual, alone.residual)
+        np.testing.assert_array_equal(found.jacobian, alone.jacobian)
 
 
 def test_a_reading_adds_to_those_before_it_only() -> None:

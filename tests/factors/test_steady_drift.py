@@ -2,6 +2,7 @@
 
 import gtsam
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -59,3 +60,17 @@ def test_a_step_without_its_drift_is_the_plain_one(seed: int) -> None:
     np.testing.assert_allclose(
         drifting.unwhitenedError(values), fixed.unwhitenedError(values), atol=1e-12
     )
+
+
+def test_the_way_is_kept_and_wrong_arguments_are_refused() -> None:
+    rng, turn, way, weights = np.random.default_rng(3), gtsam.Rot3(), np.ones(3), np.ones(2)
+    _, values = drawn_step(rng)
+    values.insert(V(), np.ones(6))
+    step = drifting_fixed_axes_step(4, turn, way, weights)
+    before = step.error(values, None)
+    way[:] = 0
+    np.testing.assert_array_equal(step.error(values, None), before)
+    with pytest.raises(ValueError, match=r"^way: of shape \(2,\); needed is \(3,\)$"):
+        drifting_fixed_axes_step(4, turn, np.ones(2), weights)
+    with pytest.raises(ValueError, match=r"^noise: of dimension 3; needed is 6$"):
+        step.factor(gtsam.noiseModel.Unit.Create(3))

@@ -11,6 +11,8 @@ from l2m_factors import (
     KeyPoseReadings,
     M,
     MapBatch,
+    N,
+    SlowError,
     TileBatch,
     WeightedField,
     X,
@@ -105,6 +107,41 @@ def test_at_the_anchor_readings_say_nothing_of_the_pose() -> None:
     batch = batch_of(random_carried(3), 1, tile_values(3))
     assert batch.keys_of(1) == [M(TILE)]
     assert batch.keys_of(0) == [X(0), X(1), M(TILE)]
+
+
+def test_a_factor_at_the_anchor_does_not_ask_for_its_pose() -> None:
+    """A graph may have another key pose of the tile, and no value of the anchor."""
+    readings, values = random_carried(3), tile_values(3)
+    at_anchor = tile_factor(batch_of(readings, 1, values), 1, whitenings(3, 4))
+    expected = at_anchor.error(values)
+    values.erase(X(1))
+    again = tile_factor(batch_of(readings, 1, values), 1, whitenings(3, 4))
+    assert again.error(values) == expected
+
+
+def test_arrays_that_are_written_into_later_change_no_factor() -> None:
+    readings, values = random_carried(3), tile_values(3)
+    for k in (0, 1):
+        values.insert(N(k), np.ones(3))
+    batch, W = batch_of(readings, 1, None), whitenings(3, 4)
+    slow = SlowError(0, np.ones((4, 2)))
+    penalty = ComplexityPenalty(np.ones((4, 3)), np.ones(4), np.ones((4, 3)))
+    factors = [tile_factor(batch, 0, W, slow=slow), effective_parameters_factor(batch, 0, penalty)]
+    before = [factor.error(values) for factor in factors if factor is not None]
+    for array in (W.own, W.common, slow.shares, penalty.at, penalty.value, penalty.slope):
+        array[:] = 0
+    assert [factor.error(values) for factor in factors if factor is not None] == before
+
+
+def test_wrong_arguments_are_refused_in_one_line() -> None:
+    batch, W = batch_of(random_carried(3), 1, tile_values(3)), whitenings(3, 4)
+    with pytest.raises(ValueError, match=r"^SlowError.shares: of shape \(1, 2\); needed is"):
+        tile_factor(batch, 0, W, slow=SlowError(0, np.ones((1, 2))))
+    with pytest.raises(ValueError, match=r"^key_pose: 2 has no readings; see key_poses of"):
+        tile_factor(batch, 2, W)
+    penalty = ComplexityPenalty(np.ones((4, 3)), np.ones(1), np.ones((4, 3)))
+    with pytest.raises(ValueError, match=r"^ComplexityPenalty.value: of shape \(1,\); needed is"):
+        effective_parameters_factor(batch, 0, penalty)
 
 
 def test_a_batch_is_evaluated_again_only_when_its_variables_change() -> None:

@@ -170,3 +170,14 @@ def test_a_factor_needs_no_values_but_its_own(monkeypatch: pytest.MonkeyPatch) -
             own.insert(values.extract([key]))
         same = next(each for each in alone if each.keys == residual.keys)
         assert_alike(same.error(own, None), residual.error(values, None))
+
+
+def test_a_whitening_is_kept_and_a_wrong_one_refused() -> None:
+    readings, values = random_carried(7), tile_values(7, 3)
+    W = random_whitening(7, len(readings))
+    (one,) = blocks_of(readings, 2, W, values).white_residuals([0])
+    (other,) = blocks_of(readings, 2, W.copy(), values).white_residuals([0])
+    W[:] = 0
+    np.testing.assert_array_equal(one.error(values, None), other.error(values, None))
+    with pytest.raises(ValueError, match=r"^whitening: of shape \(1, 3, 3\); needed is"):
+        blocks_of(readings, 2, W[:1], values)

@@ -55,6 +55,9 @@ def test_a_sensor_that_is_not_there_is_named_beside_those_that_are(
             asked["mag_7"]
         assert isinstance(error.value, InputError)
         assert str(error.value).startswith("no sensor named 'mag_7'; there are mag_0")
+        assert "mag_7" not in asked
+        assert list(asked) == [each.sensor for each in found.result.sensors]
+        assert all(name in asked for name in asked)
 
 
 def test_names_are_shown_as_text(found: JudgedCalibration) -> None:

@@ -70,6 +70,20 @@ def test_what_does_not_fit_is_one_line(changed: dict[str, Any], told: str) -> No
     assert "\n" not in str(error.value)
 
 
+def test_arrays_that_are_written_into_later_change_no_drive() -> None:
+    """No array is shared with the caller."""
+    R, t = np.tile(np.eye(3), (COUNT, 1, 1)), np.zeros(3)
+    covariance = np.tile(np.eye(6), (COUNT, 1, 1))
+    arguments = given(orientations=R, pose_covariance=covariance)
+    made, known = l2m.drive(**arguments), l2m.known_sensor("mag", t)
+    trajectory, series = made.trajectory, made.series[0]
+    kept = (trajectory.stamp_ns, trajectory.R, trajectory.p, trajectory.covariance)
+    theirs = [R, t, covariance, arguments["stamps"], arguments["positions"]]
+    theirs += [array for pair in arguments["fields"].values() for array in pair]
+    for array in (*kept, series.stamp_ns, series.field, known.t_lidar_mag):
+        assert not any(np.shares_memory(array, each) for each in theirs)
+
+
 def test_units_are_checked() -> None:
     with pytest.raises(UnitsError, match=r"0.4.* uT, as read in microtesla.*`units: gauss`"):
         l2m.drive(**given(fields={"mag": (SECONDS, FIELD / 100)}))
