@@ -95,8 +95,8 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
         more = f"The place differs from the map along {len(shared) - MANY} more stretches."
         reasons.append(Reason(Level.WARN, more))
     # A map of another place is no evidence on this one.
-    reasons += disturbance_reasons(result)
-    reasons += stated_wrongly(result.stated)
+    reasons += disturbance_reasons(result, None)
+    reasons += stated_wrongly(result.stated, None, result.pose_duration)
     return _wrong_map(cases) or [*_on_drive(cases), *reasons, *_exact(result)]
 
 
@@ -168,6 +168,16 @@ def _left_open(case: Case) -> bool:
     return case.sensor.status in OPEN or bool(too_large)
 
 
+def _own_disturbances(case: Case) -> list[Reason]:
+    """Return what disturbed this sensor alone."""
+    return disturbance_reasons(case.result, case.sensor.sensor)
+
+
+def _stated(case: Case) -> list[Reason]:
+    """Return what was stated of this sensor that its readings speak against."""
+    return stated_wrongly(case.result.stated, case.sensor.sensor, None)
+
+
 def _own_stretches(case: Case) -> list[Reason]:
     """Return stretches over which this sensor alone, of several, disagreed with the map."""
     own = [
@@ -226,6 +236,8 @@ RULES = (
     _own_stretches,
     clock,
     precision,
+    _own_disturbances,
+    _stated,
     _lower_bounds,
 )
 RULES_OF_A_MISFIT = (saturation, fit, ending)

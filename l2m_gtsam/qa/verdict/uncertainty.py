@@ -6,7 +6,9 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.error_budget import (
     Disturbance,
     DisturbanceKind,
+    DurationSource,
     ErrorCause,
+    PoseDuration,
     StatedSize,
     VarianceShare,
 )
@@ -54,18 +56,39 @@ STATED = {
 }
 
 
-def stated_wrongly(stated: Sequence[StatedSize]) -> list[Reason]:
-    """Return what was stated that the readings speak against."""
+def stated_wrongly(
+    stated: Sequence[StatedSize], sensor: str | None, lasting: PoseDuration | None
+) -> list[Reason]:
+    """Return what was stated that the readings speak against.
+
+    Parameters
+    ----------
+    stated
+        All that was stated.
+    sensor
+        Of which sensor; of none, what all of them share.
+    lasting
+        How long errors of poses last.
+    """
     return [
-        Reason(Level.WARN, _wrong(each))
+        Reason(Level.WARN, _wrong(each, lasting))
         for each in stated
-        if each.is_wrong and each.cause in STATED
+        if each.sensor == sensor and each.is_wrong and each.cause in STATED
     ]
 
 
-def _wrong(found: StatedSize) -> str:
+def _wrong(found: StatedSize, lasting: PoseDuration | None) -> str:
     what, where = STATED[found.cause]
     what = what.format(sensor=found.sensor)
+    of_poses = found.cause is ErrorCause.POSES and found.ratio < 1
+    if of_poses and lasting is not None and lasting.source is DurationSource.ASSUMED:
+        # Shorter errors of the stated size have less in common: size and duration look alike.
+        return (
+            f"The {what} are too large for errors that last {lasting.seconds:g} s, as is assumed: "
+            f"the readings show {found.ratio:.2f} times as much, and sigmas are too large. State "
+            "how long they last (calibration.solve.pose_noise.correlation_s; 0 if each pose has "
+            f"an error of its own), or correct them ({where})."
+        )
     if found.ratio > 1:
         return (
             f"The {what} are too small: the readings show {found.ratio:.1f} times as much, and "
@@ -124,10 +147,18 @@ STAND_INS = (DisturbanceKind.MOVING_PARTS,)
 MATTERS = 0.1  # of a variance: what has less of it adds 5 % to a sigma at most
 
 
-def disturbance_reasons(result: CalibrationResult) -> list[Reason]:
-    """Return what disturbed a drive: a warning where it has a share in what is not known."""
+def disturbance_reasons(result: CalibrationResult, sensor: str | None) -> list[Reason]:
+    """Return what disturbed a drive: a warning where it has a share in what is not known.
+
+    Parameters
+    ----------
+    result
+        A calibration.
+    sensor
+        Which was disturbed alone; none for what all of them share.
+    """
     reasons = []
-    for found in result.disturbances:
+    for found in (each for each in result.disturbances if each.sensor == sensor):
         matters = found.kind in STAND_INS or _share(found, result) > MATTERS
         level = Level.WARN if matters else Level.PASS
         reasons.append(Reason(level, disturbance_sentence(found)))

@@ -40,7 +40,7 @@ def found(times: float, cause: ErrorCause) -> list[StatedSize]:
 def test_what_is_stated_rightly_is_not_noted(cause: ErrorCause) -> None:
     sizes = found(1.0, cause)
     assert sizes
-    assert not stated_wrongly(sizes)
+    assert not [note for each in sizes for note in stated_wrongly([each], each.sensor, None)]
 
 
 @pytest.mark.parametrize(
@@ -58,6 +58,6 @@ def test_what_is_stated_wrongly_is_noted(times: float, words: str, cause: ErrorC
     assert all(each.status is SensorStatus.SOLVED for each in result.sensors)
     sizes = [each for each in result.stated if each.cause is cause]
     assert sizes
-    notes = stated_wrongly(sizes)
+    notes = [note for each in sizes for note in stated_wrongly([each], each.sensor, None)]
     assert len(notes) == len(sizes)
     assert all(words in each.text for each in notes)

@@ -5,9 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from l2m_gtsam.qa.verdict.uncertainty import disturbance_reasons
+from l2m_gtsam.qa.verdict.uncertainty import disturbance_reasons, stated_wrongly
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.records.error_budget import Disturbance, DisturbanceKind, ErrorCause, VarianceShare
+from l2m_gtsam.records.error_budget import (
+    Disturbance,
+    DisturbanceKind,
+    DurationSource,
+    ErrorCause,
+    PoseDuration,
+    StatedSize,
+    VarianceShare,
+)
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration
 
@@ -32,6 +40,26 @@ def with_share(share: float | None) -> CalibrationResult:
     ("share", "level"), [(0.05, Level.PASS), (0.3, Level.WARN), (None, Level.WARN)]
 )
 def test_only_a_share_in_a_variance_is_a_warning(share: float | None, level: Level) -> None:
-    (reason,) = disturbance_reasons(with_share(share))
+    (reason,) = disturbance_reasons(with_share(share), None)
     assert reason.level is level
     assert "steel or currents" in reason.text
+
+
+def test_what_disturbed_one_sensor_is_said_of_it_alone() -> None:
+    result = read_calibration(FILE)
+    one, *others = (each.sensor for each in result.sensors)
+    found = Disturbance(DisturbanceKind.WANDER, {"walk_ut": 0.3}, gain=50.0, sensor=one)
+    result = replace(result, disturbances=(found,))
+    assert len(disturbance_reasons(result, one)) == 1
+    assert not [each for name in (None, *others) for each in disturbance_reasons(result, name)]
+
+
+def test_sizes_of_errors_of_poses_are_told_with_the_duration_that_is_assumed() -> None:
+    """Errors that last shorter have less in common, as smaller ones have."""
+    too_large = [StatedSize(ErrorCause.POSES, ratio=0.2, gain=100.0)]
+    (assumed,) = stated_wrongly(too_large, None, PoseDuration(1.0, DurationSource.ASSUMED))
+    assert "too large for errors that last 1 s, as is assumed" in assumed.text
+    assert "correlation_s" in assumed.text
+    (known,) = stated_wrongly(too_large, None, PoseDuration(1.0, DurationSource.GIVEN))
+    assert "assumed" not in known.text
+    assert not stated_wrongly(too_large, "mag", None)
