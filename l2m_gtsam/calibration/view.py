@@ -7,6 +7,7 @@ step after the other asks for the field where the last one ended, of all reading
 count: ``RememberedMap`` is asked for no place twice, and remembers the last answer, too.
 """
 
+import math
 from dataclasses import dataclass, replace
 from threading import Lock, local
 from typing import Any, Protocol, runtime_checkable
@@ -353,4 +354,4 @@ def rows_among(known: FloatArray, wanted: FloatArray) -> IntArray:
 
 def _numbers(places: FloatArray) -> FloatArray:
     """Return a number for each place that hardly any other has, shape (N,)."""
-    return np.asarray(places[:, 0] + np.pi * places[:, 1] + np.e * places[:, 2])
+    return np.asarray(places[:, 0] + np.pi * places[:, 1] + math.e * places[:, 2])
