@@ -165,7 +165,7 @@ def _child(request: Request) -> None:
 
 
 def _replace_command(read: Callable[[Path], object], path: Path) -> None:
-    def command(_: list[str]) -> None:
+    def command(*_: object, **__: object) -> None:
         read(path)
 
     # Errors end as those of a command do; the process ends with it.
