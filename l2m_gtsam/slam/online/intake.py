@@ -25,6 +25,7 @@ from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, ScanAtKeyPose
 from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep, suspect_step, velocity
 from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
+from l2m_gtsam.slam.online.stamp_order import Held, decided
 from l2m_gtsam.slam.options import SlamOptions, StepAxes
 
 MOST_SCANS = 8
@@ -115,20 +116,22 @@ class Intake:
     def add_scan(self, scan: Scan) -> None:
         """Take a scan; the first pose that is no earlier becomes a key pose."""
         poses = self.state.poses
+        self._scans.append(scan)
         if poses:
-            latest = poses[-1].stamp_ns + AHEAD_S / NS
-            self._scans = [each for each in self._scans if each.stamp_ns <= latest]
-            if scan.stamp_ns > latest:
-                ahead = NS * (scan.stamp_ns - poses[-1].stamp_ns)
-                text = f"a scan is stamped {ahead:.1f} s ahead of odometry: left out"
-                self._report(scan.stamp_ns, EventKind.SCAN_REFUSED, text)
-                return
+            self._refuse_scans_ahead(poses[-1].stamp_ns)
         late = self.state.number and scan.stamp_ns <= poses[0].stamp_ns
-        if late or len(self._scans) == MOST_SCANS:
+        if late or len(self._scans) > MOST_SCANS:
+            del self._scans[-1]
             text = "a scan comes later than its key pose, or too many wait for odometry: left out"
             self._report(scan.stamp_ns, EventKind.SCAN_REFUSED, text)
-            return
-        self._scans.append(scan)
+
+    def _refuse_scans_ahead(self, last_ns: int) -> None:
+        for scan in self._scans:
+            ahead = NS * (scan.stamp_ns - last_ns)
+            if ahead > AHEAD_S:
+                text = f"a scan is stamped {ahead:.1f} s ahead of odometry: left out"
+                self._report(scan.stamp_ns, EventKind.SCAN_REFUSED, text)
+        self._scans = [each for each in self._scans if NS * (each.stamp_ns - last_ns) <= AHEAD_S]
 
     def add_odometry(self, pose: OdometryPose) -> None:
         """Take a pose; one that is no pose, or not later than the last, is refused.
@@ -157,32 +160,33 @@ class Intake:
             return
         self._append(pose.proper)
 
-    def _settle(self, next_ns: int) -> None:
-        """Decide by the time of the next pose whether one that is held counts."""
+    def _settle(self, next_ns: int | None) -> None:
+        """Decide by the time of the next pose, if there is one, whether one that is held counts."""
         held, self._held = self._held, None
         if held is None:
             return
         state, last_ns = self.state, self.state.poses[-1].stamp_ns
-        if held.stamp_ns > last_ns and next_ns > held.stamp_ns:
-            self._append(held)
-        elif held.stamp_ns > last_ns:
-            self._report_ahead(held.stamp_ns)
-        elif held.stamp_ns < next_ns < last_ns and self._may_take_back(held.stamp_ns):
-            self._take_back()
-            self._append(held)
-        else:
-            if not state.disordered:
-                late = NS * (last_ns - held.stamp_ns)
-                text = f"a pose of odometry is {late:.3f} s older than the one before: left out"
-                self._report(held.stamp_ns, EventKind.OUT_OF_ORDER, text)
-            state.disordered = True
+        match decided(held.stamp_ns, next_ns, last_ns, self._before_ns()):
+            case Held.COUNTS:
+                self._append(held)
+            case Held.IS_AHEAD:
+                self._report_ahead(held.stamp_ns)
+            case Held.LAST_IS_AHEAD:
+                self._take_back()
+                self._append(held)
+            case Held.IS_LATE:
+                if not state.disordered:
+                    late = NS * (last_ns - held.stamp_ns)
+                    text = f"a pose of odometry is {late:.3f} s older than the one before: left out"
+                    self._report(held.stamp_ns, EventKind.OUT_OF_ORDER, text)
+                state.disordered = True
 
-    def _may_take_back(self, stamp_ns: int) -> bool:
-        """Return whether the last pose is no key pose yet, and another may stand in its place."""
+    def _before_ns(self) -> float:
+        """Return the time of the pose before the last; infinite if the last is a key pose."""
         poses = self.state.poses
-        if len(poses) == 1:
-            return self.state.number == 0
-        return stamp_ns > poses[-2].stamp_ns
+        if len(poses) > 1:
+            return poses[-2].stamp_ns
+        return np.inf if self.state.number else -np.inf
 
     def _take_back(self) -> None:
         state = self.state
@@ -249,8 +253,8 @@ class Intake:
 
     def key_poses(self, *, to_the_end: bool = False) -> Iterator[ArrivedKeyPose]:
         """Yield the key poses that can be made by now; at the end of a drive all of them."""
-        if to_the_end and self._held is not None:
-            self._settle(self._held.stamp_ns + 1)  # nothing contradicts it any more
+        if to_the_end:
+            self._settle(None)
         while (row := self._next_row(to_the_end)) is not None:
             yield self._made(row)
 

@@ -9,6 +9,7 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.recording.dropouts import LEAST_SAME
 from l2m_gtsam.recording.sync import STUCK_UT
 from l2m_gtsam.slam.online.events import EventKind
+from l2m_gtsam.slam.online.stamp_order import Held, decided
 
 MOST_WAITING = 512  # of a vehicle that is parked: every other one is dropped then
 
@@ -69,8 +70,8 @@ class SensorBuffer:
         if held is None:
             return []
         waiting = self.stamp_ns and self.stamp_ns[-1] == self.last_ns
-        before_ns = self.stamp_ns[-2] if waiting and len(self.stamp_ns) > 1 else -1
-        if before_ns < held[0] < next_ns < self.last_ns:
+        before_ns = self.stamp_ns[-2] if waiting and len(self.stamp_ns) > 1 else -np.inf
+        if decided(held[0], next_ns, self.last_ns, before_ns) is Held.LAST_IS_AHEAD:
             self._take_back(*held)
             return []
         first, self.disordered = not self.disordered, True

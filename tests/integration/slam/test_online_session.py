@@ -194,6 +194,16 @@ def test_a_pose_that_is_stamped_ahead_is_taken_back(
     np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
 
 
+def test_a_late_pose_at_the_end_takes_nothing_back(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
+) -> None:
+    given = list(messages(hall[1].recording))
+    last = next(each for each in reversed(given) if isinstance(each, OdometryPose))
+    run = driven(in_map(hall), [*given, replace(last, stamp_ns=last.stamp_ns - 1_000_000)])
+    assert run.kinds == [EventKind.OUT_OF_ORDER]
+    np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
+
+
 def test_a_first_message_of_another_year_is_taken_back(
     hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
 ) -> None:
