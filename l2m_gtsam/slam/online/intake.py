@@ -23,7 +23,8 @@ from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import FixedStep, odometry_steps
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, ScanAtKeyPose
-from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep, suspect_step, velocity
+from l2m_gtsam.slam.online.odometry_check import SuspectStep, suspect_step, velocity
+from l2m_gtsam.slam.online.odometry_pose import OdometryPose, trajectory_of
 from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
 from l2m_gtsam.slam.online.stamp_order import Held, decided
 from l2m_gtsam.slam.options import SlamOptions, StepAxes
@@ -420,23 +421,3 @@ def scans_at(scans: Sequence[Scan], trajectory: Trajectory, row: int) -> tuple[S
         ScanAtKeyPose(taken_at_once(scan, twist), between(key, RigidTransform(at.R[k], at.p[k])))
         for k, (scan, twist) in enumerate(zip(scans, motion, strict=True))
     )
-
-
-def trajectory_of(poses: list[OdometryPose]) -> Trajectory:
-    """Return poses of odometry as a trajectory; with covariances if all of them state one."""
-    covariance = [each.covariance for each in poses if each.covariance is not None]
-    return Trajectory(
-        np.array([each.stamp_ns for each in poses], dtype=np.int64),
-        np.stack([each.T.R for each in poses]),
-        np.stack([each.T.t for each in poses]),
-        "odom",
-        "lidar",
-        np.stack(covariance) if len(covariance) == len(poses) else None,
-    )
-
-
-def pose_of(trajectory: Trajectory, row: int) -> OdometryPose:
-    """Return a pose of a recorded odometry."""
-    covariance = None if trajectory.covariance is None else trajectory.covariance[row]
-    T = RigidTransform(trajectory.R[row], trajectory.p[row])
-    return OdometryPose(int(trajectory.stamp_ns[row]), T, covariance)

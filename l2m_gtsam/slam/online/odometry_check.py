@@ -13,70 +13,16 @@ import gtsam
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, RigidTransform
-from l2m_gtsam.errors import InputError
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.slam.drive import as_pose, as_transform
 from l2m_gtsam.slam.online.events import EventKind
+from l2m_gtsam.slam.online.odometry_pose import OdometryPose
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.slips import FAR_DEG, FAR_M
 
 NS = 1e-9
-ORTHOGONAL = 1e-3  # of R R^T: more is no rotation
-EXACT = 1e-12  # of R R^T: less does not grow to anything
 STOOD_STILL = 0.5  # share of the expected path, below which odometry has not gone on
 NEIGHBOURS = 2.0  # steps over which the vehicle may have accelerated since the motion before
-
-
-@dataclass(frozen=True)
-class OdometryPose:
-    """A pose of odometry.
-
-    Attributes
-    ----------
-    stamp_ns
-        Its time.
-    T
-        Pose of the lidar in the frame of odometry.
-    covariance
-        That odometry states of it, as of a ``Trajectory``, (6, 6); None for none.
-    """
-
-    stamp_ns: int
-    T: RigidTransform
-    covariance: FloatArray | None = None
-
-    @property
-    def is_rigid(self) -> bool:
-        """Whether it is finite, with a rotation."""
-        R, t = self.T.R, self.T.t
-        if not (np.isfinite(R).all() and np.isfinite(t).all()):
-            return False
-        return bool(np.abs(R @ R.T - np.eye(3)).max() < ORTHOGONAL and np.linalg.det(R) > 0)
-
-    @property
-    def proper(self) -> "OdometryPose":
-        """The same in arrays of its own, with the nearest rotation, and a finite covariance."""
-        R = self.T.R.copy()
-        if np.abs(R @ R.T - np.eye(3)).max() > EXACT:
-            # What little a matrix of single precision lacks would grow from step to step.
-            R = gtsam.Rot3.ClosestTo(R).matrix()
-        covariance = self.covariance
-        if covariance is not None:
-            covariance = covariance.copy() if np.isfinite(covariance).all() else None
-        return OdometryPose(self.stamp_ns, RigidTransform(R, self.T.t.copy()), covariance)
-
-    def require_shapes(self) -> None:
-        """Raise an InputError if it is of something else than arrays of the right shapes."""
-        if not isinstance(self.T, RigidTransform):
-            came = type(self.T).__name__
-            raise InputError(f"a pose of odometry: T is a {came}; needed is a RigidTransform")
-        wanted = {"T.R": (self.T.R, (3, 3)), "T.t": (self.T.t, (3,))}
-        if self.covariance is not None:
-            wanted["covariance"] = self.covariance, (6, 6)
-        for name, (array, shape) in wanted.items():
-            if not isinstance(array, np.ndarray) or array.shape != shape:
-                came = getattr(array, "shape", type(array).__name__)
-                raise InputError(f"a pose of odometry: {name} is {came}; needed: array of {shape}")
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, Recording
 from l2m_gtsam.records.scans import Scan
-from l2m_gtsam.slam.online.intake import pose_of
-from l2m_gtsam.slam.online.odometry_check import OdometryPose
+from l2m_gtsam.slam.online.odometry_pose import OdometryPose, pose_of
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 
 

@@ -23,7 +23,8 @@ from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower, LastBelief
 from l2m_gtsam.slam.online.intake import Intake, IntakeState
-from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep
+from l2m_gtsam.slam.online.odometry_check import SuspectStep
+from l2m_gtsam.slam.online.odometry_pose import OdometryPose
 from l2m_gtsam.slam.online.packing import (
     Arrays,
     named,

@@ -28,9 +28,9 @@ from l2m_gtsam.slam.online.arguments import refuse_unusable
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower
-from l2m_gtsam.slam.online.intake import Intake, trajectory_of
+from l2m_gtsam.slam.online.intake import Intake
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
-from l2m_gtsam.slam.online.odometry_check import OdometryPose
+from l2m_gtsam.slam.online.odometry_pose import OdometryPose, trajectory_of
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanLinks, ScanMatcher
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, refuse_offline_only
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found

@@ -12,7 +12,7 @@ from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, key_poses_of
-from l2m_gtsam.slam.online.odometry_check import OdometryPose
+from l2m_gtsam.slam.online.odometry_pose import OdometryPose
 from l2m_gtsam.slam.online.replay import FieldReading, give, messages
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
