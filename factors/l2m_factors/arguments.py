@@ -75,6 +75,13 @@ def indices(name: str, values: npt.ArrayLike, count: int | None = None) -> npt.N
     return array.astype(np.int64)
 
 
+def covered(what: str, count: int, sensor: npt.NDArray[np.int64]) -> None:
+    """Raise a ValueError if readings have a sensor of which there is no calibration or the like."""
+    largest = int(sensor.max(initial=-1))
+    if largest >= count:
+        raise ValueError(f"sensor: {largest}; there are {what} of {count} sensors, from 0")
+
+
 def index(name: str, value: int, count: int) -> int:
     """Return an index from 0; a ValueError for one that is not below the count."""
     if not 0 <= value < count:

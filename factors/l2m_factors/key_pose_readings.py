@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.arguments import indices, numbers
+from l2m_factors.arguments import covered, indices, numbers
 from l2m_factors.field_map import DifferentiableMap, FloatArray
 from l2m_factors.motion import PoseMotion, moved, skew
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
@@ -176,9 +176,7 @@ class Calibrations:
             finite; the line names it.
         """
         S = len(self.t)
-        largest = int(sensor.max(initial=-1))
-        if largest >= S:
-            raise ValueError(f"sensor: {largest}; there are calibrations of {S} sensors, from 0")
+        covered("calibrations", S, sensor)
         return Calibrations(
             numbers("Calibrations.t", self.t, (S, 3)),
             numbers("Calibrations.distortion", self.distortion, (S, 12)),

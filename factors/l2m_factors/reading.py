@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.arguments import index, noise_of, numbers, of_shape
+from l2m_factors.arguments import covered, index, noise_of, numbers, of_shape
 from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.keys import D, S, T
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
@@ -81,6 +81,11 @@ class BatchedReadings:
     def sensor_of(self, reading: int) -> int:
         """Return the sensor that made this reading."""
         return int(self._readings.sensor[reading])
+
+    def sensors_of(self, rows: npt.NDArray[np.int64]) -> list[int]:
+        """Return the sensors that made some readings; a ValueError where there is no such row."""
+        index("rows", int(rows.max(initial=0)), len(self))
+        return [int(each) for each in np.unique(self._readings.sensor[rows])]
 
     def rows_of(self, sensor: int) -> npt.NDArray[np.int64]:
         """Return the indices of this sensor's readings."""
@@ -252,11 +257,8 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
 
 def _held(distortion: FloatArray, readings: MagneticReadings) -> FloatArray:
     """Return a copy of fixed distortions, shape (S, 12)."""
-    S = len(distortion)
-    largest = int(readings.sensor.max(initial=-1))
-    if largest >= S:
-        raise ValueError(f"sensor: {largest}; there are distortions of {S} sensors, from 0")
-    return numbers("distortion", distortion, (S, 12))
+    covered("distortions", len(distortion), readings.sensor)
+    return numbers("distortion", distortion, (len(distortion), 12))
 
 
 def _span(rows: npt.NDArray[np.int64]) -> Rows:

@@ -242,7 +242,7 @@ def _only_sensor(batch: BatchedReadings, rows: npt.NDArray[np.int64]) -> int:
     """Return the sensor of all these readings, whose distortion must be a variable."""
     if not len(rows):
         raise ValueError("rows: none; at least one reading is needed")
-    sensors = sorted({batch.sensor_of(index("rows", row, len(batch))) for row in rows.tolist()})
+    sensors = batch.sensors_of(rows)
     if len(sensors) > 1:
         raise ValueError(f"rows: of sensors {sensors}; make UncertainReadings of each sensor")
     if D(sensors[0]) not in batch.keys_of(sensors[0]):

@@ -44,7 +44,7 @@ class Study(ABC, Generic[Opts, Cell, Summary]):
 
     def __init_subclass__(cls) -> None:
         """Take the classes from the brackets behind ``Study``."""
-        (study,) = cls.__orig_bases__  # type: ignore[attr-defined]
+        (study,) = cls.__orig_bases__  # type: ignore[attr-defined]  # public from Python 3.12 on
         cls.options, cls.cell, cls.summary = get_args(study)
 
     @abstractmethod

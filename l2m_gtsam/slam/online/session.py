@@ -39,7 +39,7 @@ from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 
 MOST_WAITING = 2000  # key poses of a start search: of a vehicle that turns on the spot
-MOST_SILENT_M = 1.0  # path before the first readings of a start search: it adds drift alone
+SILENT_START_M = 1.0  # path before the first readings of a start search: it adds drift alone
 LAST_KEY_POSES = 20  # over which it is counted how many readings the map explains,
 LEAST_READINGS = 40  # where these have so many
 WEAKLY_HELD = (
@@ -109,7 +109,7 @@ class StartSearchState:
         """Return whether no sensor has sent for so long that the search begins anew."""
         if any(len(each.readings) for each in self.waiting):
             return False
-        return self.path_m > MOST_SILENT_M or len(self.waiting) > MOST_WAITING
+        return self.path_m > SILENT_START_M or len(self.waiting) > MOST_WAITING
 
 
 class OnlineSlam:

@@ -242,9 +242,10 @@ def test_what_is_no_message_is_refused_at_the_door(
     with pytest.raises(InputError, match=r"of shape \(2, 3\); needed is \(3,\)"):
         slam.add_reading(1, name, np.zeros((2, 3)))
     with pytest.raises(InputError, match="needed are nanoseconds as an integer"):
-        slam.add_reading(1.5, name, np.zeros(3))  # type: ignore[arg-type]
+        slam.add_reading(1.5, name, np.zeros(3))  # type: ignore[arg-type]  # the fault
+    matrix = OdometryPose(1, np.eye(4))  # type: ignore[arg-type]  # the fault
     for pose, told in (
-        (OdometryPose(1, np.eye(4)), "T is a ndarray; needed is a RigidTransform"),  # type: ignore[arg-type]
+        (matrix, "T is a ndarray; needed is a RigidTransform"),
         (OdometryPose(1, still, np.zeros(6)), r"covariance is \(6,\)"),
         (OdometryPose(1, RigidTransform(np.eye(3), np.zeros((3, 1)))), r"T.t is \(3, 1\)"),
     ):

@@ -39,4 +39,4 @@ def test_what_is_something_else_is_named_with_what_is_wanted(
 
 def test_a_judged_calibration_is_told_where_its_result_is() -> None:
     with pytest.raises(InputError, match=r"the `result` of what `l2m_gtsam.calibrate` returns"):
-        OnlineSlam(SimpleNamespace(result=KNOWN), SlamOptions())  # type: ignore[arg-type]
+        OnlineSlam(SimpleNamespace(result=KNOWN), SlamOptions())  # type: ignore[arg-type]  # fault
