@@ -5,13 +5,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, Recording, Trajectory
+from l2m_gtsam.data import FloatArray, KnownSensor, Recording, Trajectory
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.replay import FieldReading, Message, give
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.options import SlamOptions
+from tests.drives.slam import COARSE, SlamDrive, calibrated, small_hall
 from tests.support.pose_errors import pose_nees
+from tests.worlds.exact import dipole_world
 
 Messages = Iterable[Message]
+Hall = tuple[tuple[KnownSensor, ...], SlamDrive]
+WORLD, OPTIONS = dipole_world(1), SlamOptions.model_validate({"key_poses": COARSE})
+
+
+def online_hall() -> Hall:
+    """Return two sensors and a drive of 15 m with odometry that slips by 1 % of the path."""
+    return small_hall(21, seconds=25.0)
+
+
+def in_map(hall: Hall) -> OnlineSlam:
+    """Return a localisation of such a drive in its map."""
+    return OnlineSlam(calibrated(hall[0]), OPTIONS, WORLD)
 
 
 @dataclass(frozen=True)

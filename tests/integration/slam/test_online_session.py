@@ -1,13 +1,11 @@
 """Drives localised message by message, and what goes wrong on them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import FloatArray, KnownSensor, RigidTransform
-from l2m_gtsam.errors import ConfigError, InputError
+from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.follower import Follower
@@ -15,39 +13,38 @@ from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, key_poses_of
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose
 from l2m_gtsam.slam.online.replay import FieldReading, give, messages
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
-from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
-from l2m_gtsam.storage.online_log import SavedState, read_state, write_state
 from tests.drives.lost import QUICK, lost_drive, searching
-from tests.drives.online import OnlineRun, driven, seconds_of, with_readings
-from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, slam_drive, small_hall
+from tests.drives.online import (
+    OPTIONS,
+    Hall,
+    OnlineRun,
+    driven,
+    in_map,
+    online_hall,
+    seconds_of,
+    with_readings,
+)
+from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.surveyed import strange_hall, surveyed, wandering
 
-WORLD, OPTIONS = dipole_world(1), SlamOptions.model_validate({"key_poses": COARSE})
-SECONDS = 25.0
 GAP = (200, 260)  # rows of odometry
 
 
 @pytest.fixture(scope="module")
-def hall() -> tuple[tuple[KnownSensor, ...], SlamDrive]:
-    """Two sensors, 15 m, odometry that slips by 1 % of the path."""
-    return small_hall(21, seconds=SECONDS)
+def hall() -> Hall:
+    return online_hall()
 
 
 @pytest.fixture(scope="module")
-def plain(hall: tuple[tuple[KnownSensor, ...], SlamDrive]) -> OnlineRun:
+def plain(hall: Hall) -> OnlineRun:
     return driven(in_map(hall), messages(hall[1].recording))
 
 
-def in_map(hall: tuple[tuple[KnownSensor, ...], SlamDrive]) -> OnlineSlam:
-    return OnlineSlam(calibrated(hall[0]), OPTIONS, WORLD)
-
-
-def test_a_drive_is_localised_as_it_comes(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
-) -> None:
+def test_a_drive_is_localised_as_it_comes(hall: Hall, plain: OnlineRun) -> None:
     truth = hall[1].truth
     assert np.sqrt(np.mean(plain.off(truth) ** 2)) < 0.06  # the start is known within 0.1 m
     # Poses of one drive err together: no more than twice the six of one pose in the mean.
@@ -57,7 +54,7 @@ def test_a_drive_is_localised_as_it_comes(
 
 
 def test_key_poses_are_those_of_the_recording(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+    hall: Hall,
 ) -> None:
     """What comes message by message is made into the same key poses as the drive off line."""
     recording, slam = hall[1].recording, in_map(hall)
@@ -84,7 +81,7 @@ def test_key_poses_are_those_of_the_recording(
 
 
 def test_a_sensor_that_dies_and_returns_is_reported_and_does_no_harm(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+    hall: Hall,
 ) -> None:
     """One sends nothing from 8 to 14 s, the other repeats a value from 16 to 20 s."""
     sensors, drive = hall
@@ -129,7 +126,7 @@ def with_gap(drive: SlamDrive, goes_on: bool) -> list[OdometryPose | FieldReadin
 
 
 def test_a_gap_of_odometry_is_reported_and_its_sigma_says_so(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+    hall: Hall,
 ) -> None:
     """Odometry has gone on meanwhile: the pose after it is as far off as its sigma says."""
     run, truth = driven(in_map(hall), with_gap(hall[1], goes_on=True)), hall[1].truth
@@ -160,271 +157,12 @@ def test_where_odometry_stood_still_over_a_gap_the_place_is_searched_for() -> No
     assert run.trajectory().stamp_ns[-1] == truth.stamp_ns[-1]
 
 
-def test_stamps_out_of_order_are_left_out(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
-) -> None:
-    """Every fifth pose and reading comes a second time, a second later; one reading is of 2099."""
-    drive, old = hall[1], list[OdometryPose | FieldReading]()
-    given: list[OdometryPose | FieldReading] = []
-    for number, message in enumerate(messages(drive.recording)):
-        given.append(message)
-        if number % 5 == 0:
-            old.append(message)
-        if len(old) > 12:
-            given.append(old.pop(0))
-        if number == 900:
-            name = hall[0][0].sensor
-            given.append(FieldReading(4_070_908_800_000_000_000, name, np.zeros(3)))
-    run = driven(in_map(hall), given)
-    assert set(run.kinds) == {EventKind.OUT_OF_ORDER}
-    assert any("ahead of odometry" in each.text for each in run.events)
-    np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
-
-
-@pytest.mark.parametrize("ahead_s", [0.3, 2.0, 9.0])
-def test_a_pose_that_is_stamped_ahead_is_taken_back(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun, ahead_s: float
-) -> None:
-    given = list(messages(hall[1].recording))
-    at = next(n for n, each in enumerate(given) if n > 600 and isinstance(each, OdometryPose))
-    ahead = replace(given[at], stamp_ns=given[at].stamp_ns + round(1e9 * ahead_s))
-    run = driven(in_map(hall), [*given[:at], ahead, *given[at:]])
-    assert set(run.kinds) <= {EventKind.OUT_OF_ORDER, EventKind.ODOMETRY_JUMP}
-    assert run.kinds.count(EventKind.OUT_OF_ORDER) == 1
-    np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
-
-
-def test_a_late_pose_at_the_end_takes_nothing_back(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
-) -> None:
-    given = list(messages(hall[1].recording))
-    last = next(each for each in reversed(given) if isinstance(each, OdometryPose))
-    run = driven(in_map(hall), [*given, replace(last, stamp_ns=last.stamp_ns - 1_000_000)])
-    assert run.kinds == [EventKind.OUT_OF_ORDER]
-    np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
-
-
-def test_a_first_message_of_another_year_is_taken_back(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
-) -> None:
-    given, late = list(messages(hall[1].recording)), 4_070_908_800_000_000_000
-    first = next(each for each in given if isinstance(each, OdometryPose))
-    reading = FieldReading(late, hall[0][0].sensor, np.ones(3))
-    run = driven(in_map(hall), [reading, replace(first, stamp_ns=late), *given])
-    assert run.kinds.count(EventKind.OUT_OF_ORDER) == 2
-    np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
-
-
-def test_odometry_of_single_precision_in_a_buffer_that_is_used_again(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
-) -> None:
-    """Rotations off by 1e-4, as products of float32 become: as without to a millimetre."""
-    slam, R, t, b = in_map(hall), np.eye(3), np.zeros(3), np.zeros(3)
-    poses = list[OnlinePose]()
-    for each in messages(hall[1].recording):
-        if isinstance(each, OdometryPose):
-            R[:], t[:] = (1 + 1e-4) * each.T.R, each.T.t
-            poses += slam.add_odometry(replace(each, T=RigidTransform(R, t)))
-        else:
-            b[:] = each.field
-            slam.add_reading(each.stamp_ns, each.sensor, b)
-    found = np.stack([each.T_map_lidar.t for each in poses])
-    np.testing.assert_allclose(found, plain.trajectory().p[: len(found)], atol=1e-3)
-    R = poses[-1].T_map_lidar.R
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)  # rounding of many compositions
-
-
-def test_what_is_no_message_is_refused_at_the_door(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
-) -> None:
-    slam, name = in_map(hall), hall[0][0].sensor
-    still = RigidTransform(np.eye(3), np.zeros(3))
-    with pytest.raises(InputError, match=r"of shape \(2, 3\); needed is \(3,\)"):
-        slam.add_reading(1, name, np.zeros((2, 3)))
-    with pytest.raises(InputError, match="needed are nanoseconds as an integer"):
-        slam.add_reading(1.5, name, np.zeros(3))  # type: ignore[arg-type]  # the fault
-    matrix = OdometryPose(1, np.eye(4))  # type: ignore[arg-type]  # the fault
-    for pose, told in (
-        (matrix, "T is a ndarray; needed is a RigidTransform"),
-        (OdometryPose(1, still, np.zeros(6)), r"covariance is \(6,\)"),
-        (OdometryPose(1, RigidTransform(np.eye(3), np.zeros((3, 1)))), r"T.t is \(3, 1\)"),
-    ):
-        with pytest.raises(InputError, match=told):
-            slam.add_odometry(pose)
-
-
-def test_a_slip_is_reported_and_what_is_no_pose_is_refused(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
-) -> None:
-    """The wheels slip by 20 cm at 10 s; a pose is NaN, a rotation is none."""
-    drive = hall[1]
-    odometry = drive.recording.trajectory
-    p = odometry.p.copy()
-    p[200:] += np.array([0.15, 0.13, 0.0])
-    given = list(messages(replace(drive.recording, trajectory=replace(odometry, p=p))))
-    bad = OdometryPose(int(odometry.stamp_ns[300]), RigidTransform(np.eye(3), np.full(3, np.nan)))
-    worse = replace(bad, T=RigidTransform(2 * np.eye(3), np.zeros(3)))
-    run = driven(in_map(hall), [*given[:600], bad, worse, *given[600:]])
-    assert run.kinds.count(EventKind.ODOMETRY_JUMP) == 1
-    assert run.kinds.count(EventKind.UNUSABLE) == 2
-    assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.06  # as without
-    assert run.nees(drive.truth)[1:].mean() < 12
-
-
 def test_a_vehicle_in_another_place_is_reported(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+    hall: Hall,
 ) -> None:
     slam = OnlineSlam(calibrated(hall[0]), OPTIONS, dipole_world(7))
     run = driven(slam, messages(hall[1].recording))
     assert EventKind.READINGS_REFUSED in run.kinds
-
-
-def spoilt(
-    given: list[OdometryPose | FieldReading], seed: int
-) -> list[OdometryPose | FieldReading]:
-    """Return messages of which some are lost, late, twice there, not finite, or of another year."""
-    rng, found = np.random.default_rng(seed), list[OdometryPose | FieldReading]()
-    for message in given:
-        change = rng.integers(0, 60)  # six kinds of faults
-        if change == 0:
-            continue
-        if change == 1 and found:
-            found.insert(max(len(found) - int(rng.integers(1, 40)), 0), message)
-            continue
-        if change == 2:
-            found.append(message)
-        if change == 3:
-            message = replace(message, stamp_ns=int(rng.integers(-(2**60), 2**62)))
-        if change == 4 and isinstance(message, FieldReading):
-            message = replace(message, field=message.field * rng.choice([np.nan, np.inf, 1e9, 0.0]))
-        if change == 5 and isinstance(message, OdometryPose):
-            message = replace(message, covariance=np.full((6, 6), np.nan))
-        found.append(message)
-    return found
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_whatever_comes_poses_are_finite_and_sigmas_hold(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], seed: int
-) -> None:
-    """A tenth of all messages is spoilt; the first pose is right."""
-    first, *rest = list(messages(hall[1].recording))
-    run = driven(in_map(hall), [first, *spoilt(rest, seed)])
-    found = run.trajectory()
-    assert np.all(np.diff(found.stamp_ns) > 0)
-    assert found.covariance is not None
-    assert np.all(np.linalg.eigvalsh(found.covariance) > 0)
-    assert run.nees(hall[1].truth)[1:].mean() < 12
-    assert run.events
-
-
-def test_killed_and_resumed_it_goes_on(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun, tmp_path: Path
-) -> None:
-    """Killed at 12 s, resumed from its file: the poses after it are those of a run unbroken.
-
-    The open section is closed for the state, and stays linearised: by a tenth of a sigma.
-    """
-    sensors, drive = hall
-    given = list(messages(drive.recording))
-    slam, half = in_map(hall), len(given) // 2
-    before = [pose for message in given[:half] for pose in give(slam, message)]
-    path = tmp_path / "state.npz"
-    write_state(path, saved_state(slam))
-    again = resumed_slam(read_state(path), calibrated(sensors), OPTIONS, WORLD)
-    run = driven(again, given[half:])
-    assert run.kinds == [EventKind.RESUMED]
-    whole = OnlineRun((*before, *run.poses), run.events).trajectory()
-    expected = plain.trajectory()
-    np.testing.assert_array_equal(whole.stamp_ns, expected.stamp_ns)
-    assert expected.covariance is not None
-    sigma = np.sqrt(np.einsum("kii->ki", expected.covariance[:, 3:, 3:]))
-    assert (np.abs(whole.p - expected.p) / sigma).max() < 0.1
-
-
-def test_a_state_that_knows_no_steady_drift_goes_on(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
-) -> None:
-    """As it was saved before the drift was followed."""
-    sensors, drive = hall
-    given = list(messages(drive.recording))
-    slam, half = in_map(hall), len(given) // 2
-    driven(slam, given[:half])
-    state = saved_state(slam)
-    arrays = {k: v for k, v in state.arrays.items() if not k.startswith("belief.drift.")}
-    assert len(arrays) < len(state.arrays)
-    run = driven(
-        resumed_slam(SavedState(arrays, state.facts), calibrated(sensors), OPTIONS, WORLD),
-        given[half:],
-    )
-    assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.06
-
-
-def test_a_state_of_something_else_is_refused(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], tmp_path: Path
-) -> None:
-    sensors, drive = hall
-    slam = in_map(hall)
-    for message in list(messages(drive.recording))[:300]:
-        give(slam, message)
-    state = saved_state(slam)
-    with pytest.raises(ConfigError, match="another calibration"):
-        resumed_slam(state, calibrated(sensors[:1]), OPTIONS, WORLD)
-    other = OPTIONS.model_copy(update={"max_pose_gap_s": 0.4})
-    with pytest.raises(ConfigError, match="another calibration"):
-        resumed_slam(state, calibrated(sensors), other, WORLD)
-    for name in ("belief.R", "intake.stamp_ns", "base", "belief.covariance"):
-        less = SavedState({k: v for k, v in state.arrays.items() if k != name}, state.facts)
-        with pytest.raises(ConfigError, match="damaged"):
-            resumed_slam(less, calibrated(sensors), OPTIONS, WORLD)
-    path = tmp_path / "state.npz"
-    write_state(path, state)
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    path.write_bytes(content)
-    with pytest.raises(ConfigError, match="damaged"):
-        read_state(path)
-    with pytest.raises(ConfigError, match="no such file"):
-        read_state(tmp_path / "none.npz")
-
-
-def test_another_map_or_calibration_than_before_is_refused(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
-) -> None:
-    """With the same names; states that were saved before these were kept are still read."""
-    sensors, drive = hall
-    slam = in_map(hall)
-    for message in list(messages(drive.recording))[:300]:
-        give(slam, message)
-    state, known = saved_state(slam), calibrated(sensors)
-    for other in (
-        calibrated(sensors, sigma=np.full(15, 1e-3), rng=np.random.default_rng(1)),
-        calibrated(sensors, sigma=np.full(15, 1e-4)),
-    ):
-        with pytest.raises(ConfigError, match="another calibration: give that one, or begin"):
-            resumed_slam(state, other, OPTIONS, WORLD)
-    for elsewhere in (dipole_world(7), None):
-        with pytest.raises(ConfigError, match="another map: give that one, or begin"):
-            resumed_slam(state, known, OPTIONS, elsewhere)
-    arrays = {k: v for k, v in state.arrays.items() if not k.startswith("given.")}
-    facts = {k: v for k, v in state.facts.items() if k != "events"}
-    resumed_slam(SavedState(arrays, facts), known, OPTIONS, dipole_world(7))
-
-
-def test_events_that_nobody_has_read_are_saved(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive], tmp_path: Path
-) -> None:
-    slam = in_map(hall)
-    for message in list(messages(hall[1].recording))[:300]:
-        give(slam, message)
-    slam.add_reading(slam.stamp_ns, "unheard_of", np.ones(3))
-    write_state(tmp_path / "state.npz", saved_state(slam))
-    unread = slam.events()
-    assert [each.kind for each in unread] == [EventKind.UNUSABLE]
-    saved = read_state(tmp_path / "state.npz")
-    again = resumed_slam(saved, calibrated(hall[0]), OPTIONS, WORLD).events()
-    assert again[:-1] == unread
-    assert again[-1].kind is EventKind.RESUMED
 
 
 def test_a_start_is_searched_for_on_line() -> None:
@@ -502,7 +240,7 @@ def test_refined_calibrations_are_handed_out_with_what_is_known_of_them_then(
 
 
 def test_what_is_kept_does_not_grow_with_the_drive(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+    hall: Hall,
 ) -> None:
     """In a map: the state after each quarter of a drive, and a vehicle parked for half an hour."""
     given, sizes = list(messages(hall[1].recording)), list[int]()
