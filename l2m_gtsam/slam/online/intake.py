@@ -31,6 +31,8 @@ from l2m_gtsam.slam.options import SlamOptions, StepAxes
 
 MOST_SCANS = 8
 MOST_POSES = 512  # that wait for a key pose
+# No magnetometer of a vehicle reads less or more: those in gauss seem to, or in nanotesla.
+READ_UT = (1.0, 2000.0)
 AHEAD_S = 5.0  # a reading or a scan further ahead of odometry has a wrong stamp
 NS = 1e-9
 SENSOR_TEXTS = {
@@ -98,6 +100,7 @@ class Intake:
         self.state = IntakeState(sensors=[SensorBuffer() for _ in sensors.names])
         self._looked_at = 1
         self._strangers = set[str]()
+        self._implausible = set[str]()  # sensors that were reported to read no field
         self._scans: list[Scan] = []
         self._held: OdometryPose | None = None  # ahead of the last, or older: the next one decides
         self._velocities = self.state.velocity, self.state.last_velocity  # before the last pose
@@ -213,7 +216,9 @@ class Intake:
             self._looked_at = len(poses) - 1
 
     def add_reading(self, stamp_ns: int, sensor: str, value: FloatArray) -> None:
-        """Take a reading in uT; one that is not finite, late, or of another sensor is left out.
+        """Take a reading in uT.
+
+        One that is not finite, no field in that unit, late, or of another sensor is left out.
 
         Raises
         ------
@@ -229,6 +234,10 @@ class Intake:
         if own.shape != (3,):
             raise InputError(f"a reading of {sensor}: of shape {own.shape}; needed is (3,)")
         if not np.isfinite(own).all():
+            return
+        strength = float(np.linalg.norm(own))
+        if not READ_UT[0] <= strength <= READ_UT[1]:
+            self._refuse_strength(stamp_ns, sensor, strength)
             return
         poses, buffer = self.state.poses, self.state.sensors[number]
         if poses and stamp_ns > poses[-1].stamp_ns + AHEAD_S / NS:
@@ -258,6 +267,15 @@ class Intake:
             self._settle(None)
         while (row := self._next_row(to_the_end)) is not None:
             yield self._made(row)
+
+    def _refuse_strength(self, stamp_ns: int, sensor: str, strength: float) -> None:
+        if sensor not in self._implausible:
+            self._implausible.add(sensor)
+            text = (
+                f"{sensor} reads {strength:.4g} where microtesla are wanted: is it in another "
+                "unit? Such readings are left out"
+            )
+            self._report(stamp_ns, EventKind.UNUSABLE, text)
 
     def _meet_stranger(self, stamp_ns: int, sensor: str) -> None:
         if sensor not in self._strangers and len(self._strangers) < MOST_POSES:

@@ -9,7 +9,7 @@ from l2m_gtsam.data import RigidTransform
 from l2m_gtsam.errors import InputError
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose
-from l2m_gtsam.slam.online.replay import FieldReading, messages
+from l2m_gtsam.slam.online.replay import FieldReading, Message, messages
 from l2m_gtsam.slam.online.session import OnlinePose
 from tests.drives.online import (
     Hall,
@@ -42,7 +42,7 @@ def test_stamps_out_of_order_are_left_out(hall: Hall, plain: OnlineRun) -> None:
             given.append(old.pop(0))
         if number == 900:
             name = hall[0][0].sensor
-            given.append(FieldReading(4_070_908_800_000_000_000, name, np.zeros(3)))
+            given.append(FieldReading(4_070_908_800_000_000_000, name, np.full(3, 20.0)))
     run = driven(in_map(hall), given)
     assert set(run.kinds) == {EventKind.OUT_OF_ORDER}
     assert any("ahead of odometry" in each.text for each in run.events)
@@ -77,6 +77,23 @@ def test_a_first_message_of_another_year_is_taken_back(hall: Hall, plain: Online
     run = driven(in_map(hall), [reading, replace(first, stamp_ns=late), *given])
     assert run.kinds.count(EventKind.OUT_OF_ORDER) == 2
     np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-2])
+def test_readings_in_another_unit_are_left_out(hall: Hall, factor: float) -> None:
+    """One sensor reads in nanotesla or in gauss: as if it sent nothing."""
+    name, given, without = hall[0][0].sensor, list[Message](), list[Message]()
+    for each in messages(hall[1].recording):
+        if isinstance(each, FieldReading) and each.sensor == name:
+            given.append(replace(each, field=factor * each.field))
+        else:
+            given.append(each)
+            without.append(each)
+    run, silent = driven(in_map(hall), given), driven(in_map(hall), without)
+    (text,) = run.texts(EventKind.UNUSABLE)
+    assert name in text
+    assert "unit" in text
+    np.testing.assert_array_equal(run.trajectory().p, silent.trajectory().p)
 
 
 def test_odometry_of_single_precision_in_a_buffer_that_is_used_again(
