@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.error_budget import (
     Disturbance,
@@ -142,9 +144,10 @@ CAUSES = {
     DisturbanceKind.SMOOTHING: ErrorCause.SMOOTHING,
     DisturbanceKind.MOVING_PARTS: ErrorCause.MOVING_PARTS,
 }
-# What stands for numbers that were not recorded follows them by and large only.
-STAND_INS = (DisturbanceKind.MOVING_PARTS,)
 MATTERS = 0.1  # of a variance: what has less of it adds 5 % to a sigma at most
+# What stands for numbers that were not recorded follows them by and large only: what it misses is
+# no more than itself. Of a sigma of H, that adds half a percent.
+MATTERS_OF_STAND_IN = 0.1
 
 
 def disturbance_reasons(result: CalibrationResult, sensor: str | None) -> list[Reason]:
@@ -159,10 +162,18 @@ def disturbance_reasons(result: CalibrationResult, sensor: str | None) -> list[R
     """
     reasons = []
     for found in (each for each in result.disturbances if each.sensor == sensor):
-        matters = found.kind in STAND_INS or _share(found, result) > MATTERS
+        matters = _share(found, result) > MATTERS or _missed(found, result) > MATTERS_OF_STAND_IN
         level = Level.WARN if matters else Level.PASS
         reasons.append(Reason(level, disturbance_sentence(found)))
     return reasons
+
+
+def _missed(found: Disturbance, result: CalibrationResult) -> float:
+    """Return what a stand-in for numbers may miss at most, in the least sigma of its sensor's H."""
+    if found.kind is not DisturbanceKind.MOVING_PARTS or found.sensor is None:
+        return 0.0
+    size = np.linalg.norm(list(found.sizes.values()))
+    return float(size / result[found.sensor].H_sigma.min())
 
 
 def _share(found: Disturbance, result: CalibrationResult) -> float:

@@ -54,6 +54,16 @@ def test_what_disturbed_one_sensor_is_said_of_it_alone() -> None:
     assert not [each for name in (None, *others) for each in disturbance_reasons(result, name)]
 
 
+@pytest.mark.parametrize(("size", "level"), [(0.05, Level.PASS), (0.5, Level.WARN)])
+def test_what_steers_matters_beside_the_sigma_of_H(size: float, level: Level) -> None:
+    result = read_calibration(FILE)
+    name = result.sensors[0].sensor
+    steering = {"steering_ut": size * float(result[name].H_sigma.min())}
+    found = Disturbance(DisturbanceKind.MOVING_PARTS, steering, gain=50.0, sensor=name)
+    (reason,) = disturbance_reasons(replace(with_share(0.05), disturbances=(found,)), name)
+    assert reason.level is level
+
+
 def test_sizes_of_errors_of_poses_are_told_with_the_duration_that_is_assumed() -> None:
     """Errors that last shorter have less in common, as smaller ones have."""
     too_large = [StatedSize(ErrorCause.POSES, ratio=0.2, gain=100.0)]
