@@ -31,6 +31,8 @@ class GroupNoise:
     sensor, of_map, of_poses
         Mean variance of each reading by its sensor alone, and what map and poses leave beside the
         shared errors, uT^2, shapes (N,).
+    pose
+        What errors of the poses do; absent where poses are exact.
     """
 
     errors: tuple[tuple[SharedError, ...], ...]
@@ -39,6 +41,7 @@ class GroupNoise:
     sensor: FloatArray
     of_map: FloatArray
     of_poses: FloatArray
+    pose: "PoseShare | None"
 
     @property
     def rest(self) -> FloatArray:
@@ -60,6 +63,8 @@ class PoseShare:
     ----------
     knots
         Where they are variables.
+    root
+        L in rad and m, shape (N, 6, 6).
     seconds
         When poses were taken, shape (N,).
     features
@@ -71,6 +76,7 @@ class PoseShare:
     """
 
     knots: PoseKnots
+    root: FloatArray
     seconds: FloatArray
     features: FloatArray
     in_sensor: FloatArray
@@ -91,9 +97,21 @@ class PoseShare:
         """Return the covariance of a group's readings that knots leave in uT^2, (3 n, 3 n)."""
         rows, n = group.rows, len(group.rows)
         CF = self.in_sensor[rows].reshape(3 * n, -1)
-        left = self.knots.left(self.seconds[rows], self.weights[rows], self.at_knots[rows])
-        left = left[:, None, :, None]
+        left = self._left(group)[:, None, :, None]
         return np.asarray(((CF @ CF.T).reshape(n, 3, n, 3) * left).reshape(3 * n, 3 * n))
+
+    def likely(self, group: Group, weighted: FloatArray) -> FloatArray:
+        """Return the most likely errors of a group's poses beside those of the knots, (n, 6).
+
+        ``weighted`` are residuals times the inverse of their covariance, 1/uT, shape (n, 3).
+        """
+        score = np.einsum("nji,nj->ni", self.in_sensor[group.rows], weighted)
+        return np.asarray(-self._left(group) @ score)
+
+    def _left(self, group: Group) -> FloatArray:
+        """Return the covariance of a group's errors that knots leave, shape (n, n)."""
+        rows = group.rows
+        return self.knots.left(self.seconds[rows], self.weights[rows], self.at_knots[rows])
 
 
 def group_noise(
@@ -136,6 +154,7 @@ def group_noise(
             sensor=sensor,
             of_map=_mean_variance(share),
             of_poses=np.zeros(len(readings)),
+            pose=None,
         )
     left, whitenings = np.zeros_like(share), []
     for group in coverage.groups:
@@ -152,6 +171,7 @@ def group_noise(
         sensor=sensor,
         of_map=_mean_variance(share),
         of_poses=_mean_variance(left),
+        pose=pose,
     )
 
 
@@ -179,13 +199,13 @@ def pose_share(
     readings: Readings, field_map: QueryableMap, coverage: Coverage, estimate: Estimate
 ) -> PoseShare | None:
     """Return what errors of the poses do to readings; nothing where poses are exact."""
-    if coverage.knots is None:
+    if coverage.knots is None or readings.pose_root is None:
         return None
     F = error_of_poses(readings, field_map, estimate)
     C = estimate.C()[readings.sensor]
     knots, seconds = coverage.knots, coverage.seconds
     weights, at_knots = knots.weights(seconds), knots.at_knots(seconds)
-    return PoseShare(knots, seconds, F, C @ F, weights, at_knots)
+    return PoseShare(knots, readings.pose_root, seconds, F, C @ F, weights, at_knots)
 
 
 def _mean_variance(covariance: FloatArray) -> FloatArray:

@@ -30,7 +30,7 @@ from l2m_gtsam.calibration.optimise import (
     optimise,
     polish,
 )
-from l2m_gtsam.calibration.pose_errors import error_of_poses
+from l2m_gtsam.calibration.pose_errors import at_likely_poses, error_of_poses
 from l2m_gtsam.calibration.priors import Contradiction, contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.calibration.variance_parts import Parts, by_block
@@ -211,12 +211,17 @@ def joint_problem(
     """Build the joint graph at an estimate: rank test first, undetermined directions held."""
     sensor, C = view.readings.sensor, estimate.C()[view.readings.sensor]
     share = map_covariance(C, view.readings.R_map_lidar, view.map_variance)
-    if view.readings.pose_root is not None:
-        by_pose = C @ error_of_poses(view.readings, field_map, estimate)
-        share += by_pose @ by_pose.transpose(0, 2, 1)
+    features = error_of_poses(view.readings, field_map, estimate)
+    by_pose = C @ features
+    share += by_pose @ by_pose.transpose(0, 2, 1)
     covariance = reading_covariance(estimate.noise[sensor], share, view.trust)
-    batch = batch_readings(view.readings, field_map)
-    values, W = estimate.values(view.sensors), whitening(covariance)
+    values, W, readings = estimate.values(view.sensors), whitening(covariance), view.readings
+    if readings.pose_root is not None:
+        e = np.einsum("nij,nj->ni", C, view.b_lidar) + estimate.distortion[sensor, 9:]
+        white = np.einsum("nij,nj->ni", W, e - readings.field)
+        errors = -np.einsum("nij,ni->nj", W @ by_pose, white)
+        readings = at_likely_poses(readings, readings.pose_root, errors, features, C)
+    batch = batch_readings(readings, field_map)
     jacobians = {s: whitened_jacobian(batch, W, values, s) for s in view.sensors}
     tests = determinacies(jacobians, estimate.priors, values, options.rank)
     graph = reading_graph(batch, covariance, options.factors)

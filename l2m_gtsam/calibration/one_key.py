@@ -288,7 +288,9 @@ def _solved(
     if errors is None:
         found = finish.independent(joint.problem, joint.estimate)
         return replace(outcome, solved=in_order(found, alone.solved))
-    if duration := duration_of_poses(view, field_map, joint.estimate, options.pose_noise):
+    if duration := duration_of_poses(
+        view, field_map, joint.estimate, options.pose_noise, trajectory
+    ):
         pose_noise = options.pose_noise.lasting(duration.seconds)
         options = options.model_copy(update={"pose_noise": pose_noise})
     full = finish.shared(view, field_map, errors, joint.estimate, tests, options)

@@ -23,7 +23,7 @@ from scipy.linalg import cholesky, solve_triangular
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.pose_errors import error_of_poses, pose_seconds
 from l2m_gtsam.calibration.view import QueryableMap, View
-from l2m_gtsam.data import FloatArray, IntArray, Readings
+from l2m_gtsam.data import FloatArray, IntArray, Readings, Trajectory
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.error_budget import DurationSource, PoseDuration
 
@@ -103,7 +103,11 @@ class SharedErrors:
 
 
 def duration_of_poses(
-    view: View, field_map: QueryableMap, near: Estimate, options: PoseNoiseOptions
+    view: View,
+    field_map: QueryableMap,
+    near: Estimate,
+    options: PoseNoiseOptions,
+    trajectory: Trajectory | None = None,
 ) -> PoseDuration | None:
     """Return how long errors of poses last; None where poses are taken as exact.
 
@@ -117,11 +121,17 @@ def duration_of_poses(
         The optimum with independent errors.
     options
         What was stated.
+    trajectory
+        The poses. Between two of them readings have errors of both: what is stated to last less
+        lasts half the time from one to the next, where the sum over time is that of errors which
+        all poses have of their own.
     """
     if view.readings.pose_root is None:
         return None
     if options.correlation_s is not None:
-        return PoseDuration(options.correlation_s, DurationSource.GIVEN)
+        steps_ns = np.zeros(1) if trajectory is None else np.diff(trajectory.stamp_ns)
+        least_s = 0.5e-9 * float(np.median(steps_ns))
+        return PoseDuration(max(options.correlation_s, least_s), DurationSource.GIVEN)
     found = None
     if shared := shared_errors(view, field_map, near):
         found = most_likely(shared, options.lasting_s)

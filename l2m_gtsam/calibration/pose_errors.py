@@ -13,11 +13,11 @@ Knots much further apart than errors last say next to nothing of what sensors sh
 Then the variables are the means of u over the segments, which are as good as independent.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_factors import skew
+from l2m_factors import PoseMotion, moved, skew
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.view import QueryableMap, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
@@ -183,6 +183,40 @@ def pose_features(
     # b = R^T B(R t + p) under a right perturbation of the pose; see ``key_pose_residuals``.
     turn = skew(b_lidar) - slope @ skew(t)
     return np.asarray(np.concatenate([turn, slope], axis=2) @ pose_root)
+
+
+def at_likely_poses(
+    readings: Readings,
+    pose_root: FloatArray,
+    errors: FloatArray,
+    features: FloatArray,
+    C: FloatArray,
+) -> Readings:
+    """Return readings where poses are corrected by their likely errors u, which keep their prior.
+
+    A pose's own error is no variable of the graph but part of a reading's noise. What multiplies
+    the field has to be taken where the readings put the pose all the same, or it comes out too
+    small: errors in variables (Fuller, Measurement Error Models, 1987). The field takes up
+    ``C F u``, so that residuals stay those at the measured poses to first order.
+
+    Parameters
+    ----------
+    readings
+        N, with poses as they were measured.
+    pose_root
+        L in rad and m, shape (N, 6, 6).
+    errors
+        u, without a unit, shape (N, 6).
+    features
+        F, as of ``error_of_poses``, shape (N, 3, 6).
+    C
+        Distortion matrix of the sensor of each, shape (N, 3, 3).
+    """
+    twist = np.einsum("nij,nj->ni", pose_root, errors)
+    rest = PoseMotion(twist, np.zeros(len(readings)))
+    R, p = moved(readings.R_map_lidar, readings.p_map_lidar, rest, np.ones(len(readings)))
+    read = np.einsum("nij,nj->ni", C @ features, errors)
+    return replace(readings, R_map_lidar=R, p_map_lidar=p, field=readings.field + read)
 
 
 def pose_seconds(readings: Readings) -> FloatArray:

@@ -27,7 +27,7 @@ from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.joint_information import JointInformation
-from l2m_gtsam.calibration.optimise import Ending, LinearSolver
+from l2m_gtsam.calibration.optimise import Ending, LinearSolver, Optimised
 from l2m_gtsam.calibration.parts_alone import ByParts
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.stated_sizes import leave_noise
@@ -40,7 +40,7 @@ from l2m_gtsam.calibration.uncertain_graph import (
 )
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap, View
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.parallel.threads import side_by_side
 from l2m_gtsam.records.error_budget import DisturbanceKind, StatedSize
 from l2m_gtsam.solve.rank import Determinacy, RankOptions
@@ -136,7 +136,7 @@ def solve_uncertain(
             tests,
             options,
             lambda done: progress(SEARCHED + (1 - SEARCHED) * done),
-            start.values,
+            start.begin,
         )
     optimum = found.optimum
     solved, size = optimum.by_cause(optimum.solutions()), None
@@ -191,13 +191,13 @@ class ProcessStart:
         What readings share, the processes with it.
     estimate
         All sensors, with the noise that the processes leave.
-    values
+    begin
         All variables; absent where they are not those of the graph before.
     """
 
     drive: UncertainDrive
     estimate: Estimate
-    values: gtsam.Values | None
+    begin: "Beginning | None"
 
 
 def start_with(
@@ -228,7 +228,10 @@ def start_with(
     if budget.poses is None and not again:
         values = with_processes(found, budget, shown)
         estimate = estimate.updated(values, found.drive.view.sensors)
-        return ProcessStart(found.drive.beside(budget), estimate, values)
+        optimum = found.optimum
+        likely = optimum.problem.at_likely_poses(optimum.values)
+        begin = Beginning(values, near=True, readings=likely)
+        return ProcessStart(found.drive.beside(budget), estimate, begin)
     given = (found.drive.view, field_map, errors, estimate, options, budget)
     return ProcessStart(UncertainDrive.of(*given), estimate, None)
 
@@ -251,14 +254,12 @@ def settle_by_any(
     tests: Mapping[int, Determinacy],
     options: OneKeyOptions,
     progress: Callable[[float], None],
-    predicted: gtsam.Values | None = None,
+    begin: "Beginning | None" = None,
 ) -> "Settled":
-    """Solve by Cholesky, and where that is refused by QR; ``predicted`` is where the optimum is."""
-    if predicted is None:
+    """Solve by Cholesky, and where that is refused by QR; from no shared error if not elsewhere."""
+    if begin is None:
         zero = starting_values(near, drive.view.sensors, drive.prior.coverage)
         begin = Beginning(zero, near=False)
-    else:
-        begin = Beginning(predicted, near=True)
     for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):
         found = settle(drive, near, begin, tests, options, solver, progress)
         if found.ending is not Ending.SINGULAR:
@@ -283,14 +284,23 @@ def step_uncertain(
     places = ReadingPlaces.of(view.readings, field_map, near)
     drive = UncertainDrive.of(view, field_map, errors, near, options, budget.at(places))
     problem = UncertainProblem(drive, near, tests, options.factors)
-    values = starting_values(near, view.sensors, drive.prior.coverage)
+    step = step_by_any(problem, starting_values(near, view.sensors, drive.prior.coverage))
+    if problem.noise.pose is not None:
+        likely = problem.at_likely_poses(step.values)
+        problem = UncertainProblem(drive, near, tests, options.factors, readings=likely)
+        step = step_by_any(problem, step.values)
+    estimate = near.updated(step.values, view.sensors)
+    solved = UncertainOptimum.at(problem, step.values).solutions()
+    return UncertainSolution(estimate, solved, step.ending, frozenset())
+
+
+def step_by_any(problem: UncertainProblem, values: gtsam.Values) -> Optimised:
+    """Take one Gauss-Newton step by Cholesky, and where that is refused by QR."""
     for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):
         step = problem.polish(values, 1, solver)
         if step.ending is not Ending.SINGULAR:
             break
-    estimate = near.updated(step.values, view.sensors)
-    solved = UncertainOptimum.at(problem, step.values).solutions()
-    return UncertainSolution(estimate, solved, step.ending, frozenset())
+    return step
 
 
 @dataclass(frozen=True)
@@ -303,10 +313,13 @@ class Beginning:
         All variables.
     near
         Whether the optimum is so near that no descent is needed.
+    readings
+        Those of the drive where their poses are likely, if that is known.
     """
 
     values: gtsam.Values
     near: bool
+    readings: Readings | None = None
 
 
 @dataclass(frozen=True)
@@ -364,12 +377,12 @@ def settle(
     """
     sensors = drive.view.sensors
     unsettled = frozenset(sensors)
-    values, near = begin.values, begin.near
+    values, near, readings = begin.values, begin.near, begin.readings
     ending, begun = Ending.TOLERANCE, estimate
     open_ = [s for s in sensors if tests[s].place_open]
     for round_ in range(most := ROUNDS_OF_OPEN if open_ else MAX_ROUNDS):
         held_at = estimate.as_in(begun, open_)  # else they slide on with each round
-        problem = UncertainProblem(drive, estimate, tests, options.factors, held_at)
+        problem = UncertainProblem(drive, estimate, tests, options.factors, held_at, readings)
         arrived = problem.arrive(values, options, solver, near=near)
         values, joint = arrived.values, arrived.joint
         optimum = UncertainOptimum(problem, values, joint)
@@ -387,6 +400,7 @@ def settle(
         estimate = after
         if not unsettled:
             break
+        readings = problem.at_likely_poses(values)
         progress((round_ + 2) / (most + 1))
     return Settled(optimum, estimate, ending, unsettled)
 

@@ -17,7 +17,7 @@ from l2m_factors import (
 )
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
-from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover, moving_fields
+from l2m_gtsam.calibration.coverage import POSE, Coverage, UncertainMap, cover, moving_fields
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
 from l2m_gtsam.calibration.group_noise import group_noise
 from l2m_gtsam.calibration.joint_information import (
@@ -37,9 +37,11 @@ from l2m_gtsam.calibration.optimise import (
     optimise,
     polish,
 )
+from l2m_gtsam.calibration.pose_errors import at_likely_poses
 from l2m_gtsam.calibration.sensor_columns import columns_of, keys_of
+from l2m_gtsam.calibration.stated_sizes import NOTHING_LEFT
 from l2m_gtsam.calibration.view import QueryableMap, View
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.rank import Determinacy
 
 # A Gauss-Newton step of such a length leaves less than a hundredth of a sigma: from 0.17 it left
@@ -174,6 +176,8 @@ class UncertainProblem:
         One factor for a group of readings or one for each; the mathematics is the same.
     held_at
         Where directions are held that nothing determines; at the estimate if that is not given.
+    readings
+        Those of the drive where their poses are likely; as they are if that is not known.
 
     Attributes
     ----------
@@ -196,8 +200,10 @@ class UncertainProblem:
         tests: Mapping[int, Determinacy],
         factors: FactorForm,
         held_at: Estimate | None = None,
+        readings: Readings | None = None,
     ) -> None:
         view, field_map, coverage = drive.view, drive.field_map, drive.prior.coverage
+        view = view if readings is None else replace(view, readings=readings)
         self.drive, self.estimate, self.tests = drive, estimate, tests
         self.batch = batch_readings(view.readings, field_map)
         self.noise = group_noise(view, field_map, coverage, estimate)
@@ -210,8 +216,8 @@ class UncertainProblem:
         own = {s: tests[s] for s in view.sensors}
         self._sensor_priors = prior_graph(estimate if held_at is None else held_at, own)
         self.graph = gtsam.NonlinearFactorGraph()
-        for readings in self.groups:
-            self.graph.push_back(_factors(readings, factors))
+        for group in self.groups:
+            self.graph.push_back(_factors(group, factors))
         self.graph.push_back(drive.prior.graph)
         self.graph.push_back(self._sensor_priors)
 
@@ -290,6 +296,30 @@ class UncertainProblem:
         joint = joint_information(columns, rows, self.drive.prior.information, at)
         spread = self.drive.prior.coverage.spread
         return joint.loosened(U(), spread) if len(spread) else joint
+
+    def residual(self, values: gtsam.Values) -> FloatArray:
+        """Return ``e`` with the shared errors in it, uT, shape (N, 3)."""
+        residual = np.empty((len(self.drive.view.readings), 3))
+        for group, readings in zip(self.drive.prior.coverage.groups, self.groups, strict=True):
+            residual[group.rows] = readings.residual(values)
+        return residual
+
+    def at_likely_poses(self, values: gtsam.Values) -> Readings:
+        """Return the drive's readings where their poses are likely, which knots say in part.
+
+        They are as measured where poses are exact, or errors of a stated size take the place of all
+        noise: then these are too large, and what they would correct is noise.
+        """
+        readings, pose, estimate = self.drive.view.readings, self.noise.pose, self.estimate
+        if pose is None or (estimate.noise[self.drive.view.sensors] <= NOTHING_LEFT).any():
+            return readings
+        errors, residual = np.empty((len(readings), POSE)), self.residual(values)
+        groups = self.drive.prior.coverage.groups
+        for group, W in zip(groups, self.noise.whitenings, strict=True):
+            weighted = W.T @ (W @ residual[group.rows].ravel())
+            errors[group.rows] = pose.likely(group, weighted.reshape(-1, 3))
+        of_each = estimate.C()[readings.sensor]
+        return at_likely_poses(readings, pose.root, errors, pose.features, of_each)
 
     def same_noise(self, one: Estimate, other: Estimate, sensor: int) -> bool:
         """Return whether no reading's standard deviation differs by more than 0.1 % for a sensor's.

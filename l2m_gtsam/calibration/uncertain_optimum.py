@@ -221,10 +221,7 @@ class UncertainOptimum:
     @cached_property
     def _residual(self) -> FloatArray:
         """``e`` with the shared errors in it, uT, shape (N, 3)."""
-        residual = np.empty((len(self._view.readings), 3))
-        for group, readings in zip(self._coverage.groups, self.problem.groups, strict=True):
-            residual[group.rows] = readings.residual(self.values)
-        return residual
+        return self.problem.residual(self.values)
 
     @cached_property
     def _left(self) -> FloatArray:

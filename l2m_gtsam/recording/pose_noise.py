@@ -20,8 +20,9 @@ class PoseNoiseOptions(Options):
     """Standard deviation of the rotation about each axis in degrees, in the same way."""
     correlation_s: float | None = Field(default=None, ge=0)
     """How long an error lasts in seconds: the correlation of two errors falls to 1/e over this
-    time. 0 means that every pose has an error of its own. If it is not given, a calibration finds
-    it from what readings of different sensors share; it is 1 second if they do not determine it."""
+    time. 0 means that every pose has an error of its own; readings between two have both's. If
+    it is not given, a calibration finds it from what readings of different sensors share; it is
+    1 second if they do not determine it."""
 
     @property
     def lasting_s(self) -> float:

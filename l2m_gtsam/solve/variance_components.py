@@ -143,8 +143,7 @@ class WeightSystem:
         """Return what the readings make of weights of these prior variances, shape (m,)."""
         at = np.flatnonzero(variances > 0)
         root, I_at = np.sqrt(variances[at]), self.information[at]
-        inner = np.eye(len(at)) + root[:, None] * I_at[:, at] * root
-        lower = cholesky(inner, lower=True, check_finite=False)
+        lower = self.among(at)._factor(root)
         white = solve_triangular(
             lower, root[:, None] * np.column_stack([I_at, self.pull[at]]), lower=True
         )

@@ -1,5 +1,6 @@
 """How long errors of poses last is found from what readings of different sensors share."""
 
+import numpy as np
 import pytest
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
@@ -45,3 +46,11 @@ def test_what_is_given_counts_and_too_few_readings_tell_nothing() -> None:
     few = result(5.0, readings=OPTIONS.readings).pose_duration
     assert few is not None
     assert few.source is DurationSource.ASSUMED
+
+
+def test_between_two_poses_readings_have_errors_of_both() -> None:
+    recording, _ = troubled_drive(OPTIONS, hall(Trouble.CLEAN), Trouble.POSES, DRIVE)
+    between_s = 1e-9 * np.median(np.diff(recording.trajectory.stamp_ns))
+    own = result(2.0, stated_s=0.0, readings=OPTIONS.readings).pose_duration
+    assert own is not None
+    assert own.seconds == pytest.approx(between_s / 2)

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import Estimate
@@ -13,6 +15,7 @@ from l2m_gtsam.calibration.pose_errors import error_of_poses
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.solve.robust import Loss, RobustOptions
 from tests.drives.uncertain import (
     NOISE,
@@ -122,3 +125,44 @@ def test_errors_that_vanish_change_nothing(uncertain: Readings, field_map: Harmo
         other.solved[0].covariance / np.outer(sigma, sigma),
         atol=3e-3,
     )
+
+
+def independently_wrong(field_map: HarmonicMap, seed: int, rotation_deg: float) -> Readings:
+    """Readings of the first sensor on a level drive in the field of the map itself.
+
+    Each has a pose that is turned by an error of its own.
+    """
+    rng, count = np.random.default_rng(seed), 2000
+    angles = np.column_stack([rng.uniform(-np.pi, np.pi, count), rng.normal(0, 0.02, (count, 2))])
+    R = Rotation.from_euler("ZYX", angles).as_matrix()
+    p = np.column_stack([rng.uniform(-1.1, 1.1, (count, 2)), rng.uniform(0.4, 0.6, count)])
+    B, _ = field_map.field_and_gradient(R @ SENSORS[0].t_lidar_mag + p)
+    b = np.einsum("nji,nj->ni", R, B)
+    sigma = np.deg2rad(rotation_deg)
+    wrong = R @ Rotation.from_rotvec(rng.normal(0, sigma, (count, 3))).as_matrix()
+    return Readings(
+        sensors=(SENSORS[0].sensor,),
+        sensor=np.zeros(count, dtype=np.int64),
+        stamp_ns=np.arange(count) * 10_000_000,
+        R_map_lidar=wrong,
+        p_map_lidar=p,
+        field=SENSORS[0].distortion.apply(b) + rng.normal(0, NOISE, (count, 3)),
+        pose_root=np.broadcast_to(np.diag(np.repeat([sigma, 1e-6], 3)), (count, 6, 6)),
+    )
+
+
+@pytest.mark.parametrize("uncertainty", Uncertainty)
+def test_errors_that_each_pose_has_of_its_own_do_not_shrink_C(
+    field_map: HarmonicMap, uncertainty: Uncertainty
+) -> None:
+    alone = OPTIONS.pose_noise.model_copy(update={"correlation_s": 0.0})
+    options = OPTIONS.model_copy(update={"pose_noise": alone, "uncertainty": uncertainty})
+    truth, squared = np.concatenate([SENSORS[0].t_lidar_mag, SENSORS[0].distortion.vector()]), []
+    for seed in range(2):
+        solution = solve_one_key(
+            independently_wrong(field_map, seed, 0.8), field_map, STARTS[:1], options
+        )
+        e, covariance = solution.estimate.vector(0) - truth, solution.solved[0].covariance
+        squared.append(e @ np.linalg.solve(covariance, e))
+    # The map is exact and its errors are counted all the same: 22 instead of 30 are expected.
+    assert np.sum(squared) < chi2.ppf(0.999, 2 * 15)

@@ -144,6 +144,8 @@ def test_information_that_rounding_made_indefinite_has_sizes_all_the_same() -> N
     information = (axes * values) @ axes.T
     pull = information @ (1e3 * rng.standard_normal(WEIGHTS))
     spectra = np.repeat(np.eye(2), [4, WEIGHTS - 4], axis=1)
-    found = WeightSystem(0.5 * (information + information.T), pull).components(spectra)
+    known = WeightSystem(0.5 * (information + information.T), pull)
+    found = known.components(spectra)
     assert np.isfinite(found.sizes).all()
     assert found.gain > 0
+    assert np.isfinite(known.posterior(np.full(WEIGHTS, 1e4)).rest).all()
