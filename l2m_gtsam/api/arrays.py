@@ -190,7 +190,8 @@ def _strength_fault(field: FloatArray, units: Units) -> str | None:
     Constant readings are judged, too: whoever gives arrays gives all of one unit.
     """
     judged, own = (Unit.AUTO, units) if isinstance(units, Unit) else (units, None)
-    return field_fault(field, judged, own) or strength_fault(field, judged, own)
+    name = "units"  # of the argument
+    return field_fault(field, judged, own, name) or strength_fault(field, judged, own, name)
 
 
 def _units(units: str | float) -> Units:

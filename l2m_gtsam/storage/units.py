@@ -15,6 +15,7 @@ from l2m_gtsam.data import FloatArray
 PLAUSIBLE_UT = (10.0, 200.0)
 EARTH_UT = 50.0
 UNDISTURBED_UT = (20.0, 80.0)  # away from steel
+OPTION = "bag.units"  # that names the unit of a log
 NORMALISED = (0.7, 1.4)  # lengths of directions before a calibration
 # A strength that is constant to this, relative, over many readings was normalised.
 CONSTANT = 1e-6
@@ -107,7 +108,9 @@ def are_counts(written: FloatArray) -> bool:
     return len(finite) >= ENOUGH_READINGS and bool((finite == np.round(finite)).all())
 
 
-def field_fault(written: FloatArray, units: Units, own: Unit | None) -> str | None:
+def field_fault(
+    written: FloatArray, units: Units, own: Unit | None, option: str = OPTION
+) -> str | None:
     """Return what is wrong with readings as they are written, as half a sentence, or None.
 
     Parameters
@@ -116,6 +119,8 @@ def field_fault(written: FloatArray, units: Units, own: Unit | None) -> str | No
         Readings as they are in the messages, shape (N, 3).
     units, own
         As in ``microtesla_per``; only `AUTO` is judged by strength.
+    option
+        What names the unit, for advice.
     """
     found, turning = strength(written), is_turning(written)
     if not found.readings or (found.is_constant and not turning):
@@ -125,10 +130,12 @@ def field_fault(written: FloatArray, units: Units, own: Unit | None) -> str | No
             f"every reading is {found.median:.4g} long, as written: directions without a "
             "strength (no unit at all), which cannot be calibrated; record the raw field"
         )
-    return strength_fault(written, units, own)
+    return strength_fault(written, units, own, option)
 
 
-def strength_fault(written: FloatArray, units: Units, own: Unit | None) -> str | None:
+def strength_fault(
+    written: FloatArray, units: Units, own: Unit | None, option: str = OPTION
+) -> str | None:
     """Return what is wrong with the strength of readings alone; see ``field_fault``.
 
     Readings that are all the same are judged, too; not those of a dead sensor, which are zeros.
@@ -141,17 +148,17 @@ def strength_fault(written: FloatArray, units: Units, own: Unit | None) -> str |
     if are_counts(written):
         return (
             f"every reading is a whole number, a typical |B| {found.median:.4g}: raw counts; find "
-            "the microtesla per count in the sensor's data sheet and set them as a number, "
-            "`units: 0.15  # uT per count`, or name the unit if it was rounded"
+            "the microtesla per count in the sensor's data sheet and set them as a number, as "
+            f"`{option}: 0.15`, or name the unit if it was rounded"
         )
     if own is None:
         return (
             f"a typical |B| of {found.median:.4g} is in a unit that the log does not state; "
-            f"{_suspicion(found.median)}"
+            f"{_suspicion(found.median, option)}"
         )
     return (
         f"a typical |B| of {found.median * MICROTESLA_PER[own]:.4g} uT, as read in {own.value}, is "
-        f"not the {low:g} to {high:g} uT found on Earth; {_suspicion(found.median)}"
+        f"not the {low:g} to {high:g} uT found on Earth; {_suspicion(found.median, option)}"
     )
 
 
@@ -181,23 +188,23 @@ def _suspects(as_written: float) -> list[Unit]:
     return sorted(fitting, key=lambda u: _distance(as_written * MICROTESLA_PER[u]))
 
 
-def _suspicion(as_written: float) -> str:
+def _suspicion(as_written: float, option: str) -> str:
     """Return the likely unit of a strength as written in the message."""
     suspects = _suspects(as_written)
     if not suspects:
         return (
-            f"{as_written:.4g} fits no unit of field; name it with the option `units:`, or give "
-            "the microtesla per unit as a number"
+            f"{as_written:.4g} fits no unit of field; name it with `{option}`, or give the "
+            "microtesla per unit as a number"
         )
     likely = suspects[0]
     fields = {each: as_written * MICROTESLA_PER[each] for each in suspects}
     low, high = UNDISTURBED_UT
     if low <= fields[likely] <= high:
-        return f"it is likely {likely.value}: set the option `units: {likely.value}`"
+        return f"it is likely {likely.value}: set `{option}: {likely.value}`"
     may_be = [f"{unit.value} ({field:.3g} uT)" for unit, field in fields.items()]
     if NORMALISED[0] <= as_written <= NORMALISED[1]:
         may_be.append("a direction without a strength, which cannot be calibrated")
-    return f"it may be {' or '.join(may_be)}: set the option `units:`, as `units: {likely.value}`"
+    return f"it may be {' or '.join(may_be)}: set `{option}`, as `{option}: {likely.value}`"
 
 
 def _distance(field_ut: float) -> float:

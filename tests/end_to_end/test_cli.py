@@ -169,7 +169,7 @@ def test_wrong_units_are_refused_and_overridden(demo: Demo, tmp_path: Path) -> N
         entries.append(Entry("/mag", "sensor_msgs/MagneticField", stamp, reading))
     bag = write(tmp_path, "mcap", entries)
     line = complaint_here("map", "build", bag, "--out", tmp_path / "m.npz")
-    assert "likely gauss: set the option `units: gauss`" in line
+    assert "likely gauss: set `bag.units: gauss`" in line
     assert not (tmp_path / "m.npz").exists()
 
 

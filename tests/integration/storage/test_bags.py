@@ -150,7 +150,7 @@ def test_tf_chain_with_static_and_inverse_links(tmp_path: Path, kind: str) -> No
 def test_units_are_suspected_and_overridden(tmp_path: Path, factor: float, unit: str) -> None:
     """The Earth's 45 uT written in another unit. 1e7: 450 mG is as likely 450 uT / 10."""
     path = write(tmp_path, "mcap", entries("mcap", field=lambda k: factor * EARTH * (1 + k / 100)))
-    with pytest.raises(UnitsError, match=rf"/mag.*`units: {unit}`") as error:
+    with pytest.raises(UnitsError, match=rf"/mag.*`bag.units: {unit}`") as error:
         read_recording(path, BagOptions())
     assert "\n" not in str(error.value)
     found = read_recording(path, BagOptions(units=Unit(unit)))

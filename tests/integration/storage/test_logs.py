@@ -170,7 +170,7 @@ def test_named_columns_and_raw_counts(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"no column with times.*columns.stamp.*raw a"):
         read_fields(path, BagOptions())
     columns = ColumnOptions(stamp="when", fields={"left": ("raw a", "raw b", "raw c")})
-    with pytest.raises(UnitsError, match=r"whole number.*raw counts.*uT per count") as error:
+    with pytest.raises(UnitsError, match=r"whole number.*raw counts.*microtesla per count") as error:
         read_fields(path, BagOptions(columns=columns))
     assert "milligauss" not in str(error.value)
     (found,) = read_fields(path, BagOptions(columns=columns, units=0.0578))

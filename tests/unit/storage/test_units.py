@@ -35,7 +35,7 @@ def test_the_true_unit_is_named(unit: str, strength_ut: float) -> None:
     read_as_tesla = turning_field(strength_ut, 1e-2) / MICROTESLA_PER[Unit(unit)] * 1e6
     sentence = judged(read_as_tesla)
     assert sentence is not None
-    assert f"`units: {unit}`" in sentence
+    assert f"`bag.units: {unit}`" in sentence
 
 
 @pytest.mark.parametrize("strength_ut", [1.0, 50.0, 100.0, 1e6])
@@ -81,7 +81,7 @@ def test_half_missing_readings_do_not_count() -> None:
     [
         (178.0, "may be milligauss (17.8 uT) or microtesla (178 uT)"),
         (1.05, "may be gauss (105 uT) or a direction without a strength"),
-        (0.45, "likely gauss: set the option `units: gauss`"),
+        (0.45, "likely gauss: set `bag.units: gauss`"),
     ],
 )
 def test_what_may_be_several_units_is_not_called_one(written: float, told: str) -> None:
