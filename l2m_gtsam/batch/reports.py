@@ -212,11 +212,14 @@ def calibration_results(out: Path) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        They cannot be written, or the folder holds a localisation, too.
+        They cannot be written, or the folder holds a localisation.
     """
     names = (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE, REPORT_FILE, PDF_FILE, OUTCOME_FILE)
     check_outputs(*(out / name for name in names))
-    holds_localisation(out)
+    if holds_localisation(out):
+        raise OutputError(
+            f"{out}: holds a localisation, whose report would be lost; choose another --out"
+        )
     with published(out, *names, unlisted=(OUTCOME_FILE,)) as stage:
         yield stage
 

@@ -18,7 +18,7 @@ from l2m_gtsam.calibration.stretch_causes import with_causes
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.calibration.verdicts import SolvedDrive, sensor_verdicts
 from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, for_solvers
-from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile, Synchronised
+from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile, Synchronised, Trajectory
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised, check_frame
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -144,7 +144,7 @@ def calibrated(
     )
     sensors = sensor_verdicts(drive, options)
     if not solution.solved:
-        covered = bool(np.mean(field_map.query(recording.trajectory.p).inside) > COVERED)
+        covered = covers(field_map, recording.trajectory)
         raise CalibrationError(_nothing_solved(recording, map_source, sensors, covered))
     stretches = _rejected_stretches(solution, solver_map, options)
     result = CalibrationResult(
@@ -318,11 +318,21 @@ def _nothing_solved(
             "it the map of another place, or is the start of a sensor wrong?"
         )
     if outside:
-        low, high = recording.trajectory.p.min(axis=0), recording.trajectory.p.max(axis=0)
-        return (
-            f"{place} does not cover the drive {recording.source.path}, which runs from "
-            f"({low[0]:.1f}, {low[1]:.1f}, {low[2]:.1f}) to ({high[0]:.1f}, {high[1]:.1f}, "
-            f"{high[2]:.1f}) m in frame {recording.trajectory.frame!r}: is it another place or "
-            "another map frame?"
-        )
+        return not_covered(recording, place)
     return f"{unsolved}: {first.sensor}: {first.message}"
+
+
+def covers(field_map: QueryableMap, poses: Trajectory) -> bool:
+    """Return whether a map has data where the lidar was, most of the time."""
+    return bool(np.mean(field_map.query(poses.p).inside) > COVERED)
+
+
+def not_covered(recording: Recording, place: str) -> str:
+    """Return that a map, by its name, is not that of the drive, and where the drive was."""
+    low, high = recording.trajectory.p.min(axis=0), recording.trajectory.p.max(axis=0)
+    return (
+        f"{place} does not cover the drive {recording.source.path}, which runs from "
+        f"({low[0]:.1f}, {low[1]:.1f}, {low[2]:.1f}) to ({high[0]:.1f}, {high[1]:.1f}, "
+        f"{high[2]:.1f}) m in frame {recording.trajectory.frame!r}: is it another place or "
+        "another map frame?"
+    )

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.calibration.calibrate import prepare
+from l2m_gtsam.calibration.calibrate import covers, not_covered, prepare
 from l2m_gtsam.calibration.explanation import from_priors, undetermined
 from l2m_gtsam.calibration.forecast import Forecast, forecast
 from l2m_gtsam.calibration.joint import SensorSolution
@@ -130,7 +130,7 @@ def plan(
     with reported("what the drive determines", progress):
         found = task.forecast(readings)
     if not found.view.inside.any():
-        raise CalibrationError(f"the map does not cover the drive {recording.source.path}")
+        raise CalibrationError(_outside(recording, task, readings.sensors))
     sensors = _sensor_plans(synchronised, recording.trajectory, found, task)
     worsts = [worst(each.sensor, each.covariance, options.solve.rank) for each in sensors]
     read = np.unique(readings.sensor).tolist()
@@ -145,6 +145,20 @@ def plan(
         worst=one.worst(alone),
         motions=motions,
         doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
+    )
+
+
+def _outside(recording: Recording, task: Task, sensors: tuple[str, ...]) -> str:
+    """Return why the map knows nothing of any sensor."""
+    if not covers(task.field_map, recording.trajectory):
+        return not_covered(recording, "the map")
+    places = (
+        f"{name} ({t[0]:g}, {t[1]:g}, {t[2]:g})" for name, t in zip(sensors, task.t, strict=True)
+    )
+    return (
+        f"the map covers the drive {recording.source.path}, but no place of a sensor: "
+        f"{', '.join(places)}; give metres from the lidar, in its frame, with `--at` or "
+        "`calibration.start`"
     )
 
 

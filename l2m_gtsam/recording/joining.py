@@ -128,6 +128,13 @@ def _check(recordings: Sequence[Recording]) -> None:
                 f"{one.source.path} and {other.source.path} are the same drive, listed twice; "
                 "list each drive once"
             )
+        if _one_way(one, other):
+            raise CalibrationError(
+                f"{one.source.path} and {other.source.path} have the same poses and readings of "
+                "the same time: they are one drive, not two; put the readings of all sensors into "
+                "one log, in a table with columns for each, as front_mag_x, rear_mag_x (a cell "
+                "without a reading is empty)"
+            )
     first = recordings[0]
     for each in recordings:
         path, poses = each.source.path, each.trajectory
@@ -154,6 +161,23 @@ def _check(recordings: Sequence[Recording]) -> None:
                 f"{path}: none of its sensors ({', '.join(own)}) is in another drive, which have "
                 f"{', '.join(sorted(others))}; calibrate it by itself"
             )
+
+
+def _one_way(one: Recording, other: Recording) -> bool:
+    """Whether two recordings are of one drive, as far as poses and times tell."""
+    return (
+        np.array_equal(one.trajectory.stamp_ns, other.trajectory.stamp_ns)
+        and np.array_equal(one.trajectory.p, other.trajectory.p)
+        and any(_overlap(a, b) for a in one.series for b in other.series)
+    )
+
+
+def _overlap(one: FieldSeries, other: FieldSeries) -> bool:
+    """Whether series, in order of time, have readings of one time."""
+    if not (len(one) and len(other)):
+        return False
+    last_start = max(one.stamp_ns[0], other.stamp_ns[0])
+    return bool(last_start <= min(one.stamp_ns[-1], other.stamp_ns[-1]))
 
 
 def _same(one: Recording, other: Recording) -> bool:

@@ -288,8 +288,11 @@ def _nothing_left(recording: Recording, options: SyncOptions, largest_offset_s: 
     span = f"{min(s[0] for s in stamps) * 1e-9:.3f} to {max(s[-1] for s in stamps) * 1e-9:.3f} s"
     poses = f"{trajectory.stamp_ns[0] * 1e-9:.3f} to {trajectory.stamp_ns[-1] * 1e-9:.3f} s"
     around = f" for {largest_offset_s:g} s around each reading" if largest_offset_s else ""
+    remedy = "try `bag.stamps: record`"
+    if recording.poses is not None:
+        remedy = f"`bag.pose_file.offset_s` is added to the times of {recording.poses.path}"
     return (
         f"{recording.source.path}: no finite reading has a pose: readings run from {span}, poses "
         f"from {poses}, and poses may be {options.max_pose_gap_s:g} s apart at most{around} "
-        "(`max_pose_gap_s`); if their clocks differ, try `bag.stamps: record`"
+        f"(`max_pose_gap_s`); if their clocks differ, {remedy}"
     )

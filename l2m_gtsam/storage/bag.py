@@ -80,7 +80,7 @@ def read_recording(path: Path, options: BagOptions, progress: Count | None = Non
         paths = _path_poses(bag, poses, progress)
     series = _all_series(path, buffers, fields, options)
     trajectory = _trajectory(path, buffers, options, paths)
-    check_clocks(path, trajectory, series)
+    check_clocks(path, trajectory, series, apart)
     notes, origins = _clocks(path, buffers, options), tuple[str, ...]()
     source = None if apart is None else source_file(apart)
     if source is not None:

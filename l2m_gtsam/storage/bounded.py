@@ -21,12 +21,14 @@ import numpy as np
 import numpy.typing as npt
 
 from l2m_gtsam.errors import L2MError
+from l2m_gtsam.text import shown
 
 MEGABYTE = 1_000_000
 # The end of an archive: its signature, eight bytes, then the size of its directory.
 END, END_BYTES, LONGEST_COMMENT = b"PK\x05\x06", 22, 1 << 16
 MOST_DIRECTORY = 1 << 20  # of thousands of members
 PIECE = 1 << 24
+MOST_NAMES = 6  # in a message
 
 
 @contextmanager
@@ -77,7 +79,8 @@ def open_regular(path: Path) -> BufferedReader:
     if stat.S_ISREG(mode):
         return os.fdopen(handle, "rb")
     os.close(handle)
-    raise OSError(errno.EINVAL, f"{_kind(mode)}; a regular file is expected", str(path))
+    wanted = f"a regular file is expected{_files_in(path) if stat.S_ISDIR(mode) else ''}"
+    raise OSError(errno.EINVAL, f"{_kind(mode)}; {wanted}", str(path))
 
 
 def read_content(
@@ -128,6 +131,16 @@ def _why(reason: Exception, missing: str) -> str:
     if isinstance(reason, FileNotFoundError):
         return missing
     return f"cannot be read: {getattr(reason, 'strerror', None) or reason}"
+
+
+def _files_in(folder: Path) -> str:
+    """Return what could be given instead of a folder, as the end of a sentence."""
+    try:
+        names = sorted(each.name for each in folder.iterdir() if not each.name.startswith("."))
+    except OSError:
+        return ""
+    more = ["..."] if len(names) > MOST_NAMES else []
+    return f"; in it: {', '.join([*map(shown, names[:MOST_NAMES]), *more])}" if names else ""
 
 
 def _kind(mode: int) -> str:

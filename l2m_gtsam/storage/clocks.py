@@ -18,6 +18,12 @@ from l2m_gtsam.storage.messages import StampBuffer
 OTHER_CLOCK_NS = 3_600_000_000_000
 LEAST_S = 0.1  # by which a clock is set; less may be the load of a computer
 USUAL = 10.0  # times what half of the messages jitter by, more than which is no jitter
+UNSTAMPED = "all header stamps are 0; use the record time instead with `bag.stamps: record`"
+OTHER_CLOCKS = (
+    "their header stamps are of different clocks (simulated and record time?); try "
+    "`bag.stamps: record`"
+)
+OTHER_TIMES = "their times are of different clocks, or since different moments"
 # Before and after, over which delays are compared; what came at once, after a pause, says nothing.
 NEAR_S, FAR_S = 1.0, 10.0
 LEAST_MESSAGES = 5  # on either side
@@ -134,15 +140,29 @@ def clock_notes(
 
 def check_stamps(path: Path, what: str, stamps: IntArray) -> None:
     """Raise a BagError if no message was stamped."""
-    if len(stamps) and stamps[-1] == 0:
-        raise BagError(
-            f"{path}: {what}: all header stamps are 0; use the record time instead with "
-            "`bag.stamps: record`"
-        )
+    if len(stamps) and not stamps.any():
+        raise BagError(f"{path}: {what}: {UNSTAMPED}")
 
 
-def check_clocks(path: Path, poses: Trajectory, series: tuple[FieldSeries, ...]) -> None:
-    """Raise a BagError if poses and readings have different clocks."""
+def check_clocks(
+    path: Path,
+    poses: Trajectory,
+    series: tuple[FieldSeries, ...],
+    pose_file: Path | None = None,
+) -> None:
+    """Raise a BagError if poses and readings have different clocks.
+
+    Parameters
+    ----------
+    path
+        The log.
+    poses, series
+        What was read.
+    pose_file
+        File with the poses, if they are not in the log.
+    """
+    whose = "the poses" if pose_file is None else f"the poses of {pose_file}"
+    clocks = OTHER_CLOCKS if pose_file is None else f"{OTHER_TIMES}; {set_to_meet(pose_file)}"
     for each in series:
         if not len(each) or not len(poses):
             continue
@@ -150,7 +170,13 @@ def check_clocks(path: Path, poses: Trajectory, series: tuple[FieldSeries, ...])
         if apart > OTHER_CLOCK_NS:
             raise BagError(
                 f"{path}: topic {each.topic} runs from {each.stamp_ns[0] * 1e-9:.3f} to "
-                f"{each.stamp_ns[-1] * 1e-9:.3f} s, the poses from {poses.stamp_ns[0] * 1e-9:.3f} "
-                f"to {poses.stamp_ns[-1] * 1e-9:.3f} s: their header stamps are of different "
-                "clocks (simulated and record time?); try `bag.stamps: record`"
+                f"{each.stamp_ns[-1] * 1e-9:.3f} s, {whose} from {poses.stamp_ns[0] * 1e-9:.3f} "
+                f"to {poses.stamp_ns[-1] * 1e-9:.3f} s: {clocks}"
             )
+
+
+def set_to_meet(pose_file: Path | None) -> str:
+    """Return what to do about times of poses, of a file or of the log, that miss the readings."""
+    if pose_file is None:
+        return "use the record time with `bag.stamps: record`"
+    return f"add what lies between to the times of {pose_file} with `bag.pose_file.offset_s`"

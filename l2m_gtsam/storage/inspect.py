@@ -13,6 +13,7 @@ from l2m_gtsam.progress import Count
 from l2m_gtsam.recording.saturation import saturated_axes, saturation_sentence
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps
 from l2m_gtsam.storage.bag_report import POSE_FILE, BagReport, TopicReport
+from l2m_gtsam.storage.clocks import UNSTAMPED, set_to_meet
 from l2m_gtsam.storage.field_types import (
     FIELD_TYPES,
     VECTOR_TYPE,
@@ -144,18 +145,16 @@ def _clock_obstacles(used: list[TopicReport], options: BagOptions) -> list[str]:
     """Return what is wrong with the header stamps of the topics that would be used."""
     if options.stamps is Stamps.RECORD:
         return []
-    advice = "use the record time with `bag.stamps: record`"
-    found = [
-        f"{r.topic}: all header stamps are 0; {advice}" for r in used if r.span_s == (0.0, 0.0)
-    ]
+    found = [f"{r.topic}: {UNSTAMPED}" for r in used if r.span_s == (0.0, 0.0)]
     moving = [r for r in used if np.isfinite(r.span_s[0]) and r.span_s[1] > 0]
     latest_start = max(moving, key=lambda r: r.span_s[0], default=None)
     earliest_end = min(moving, key=lambda r: r.span_s[1], default=None)
     if latest_start and earliest_end and latest_start.span_s[0] > earliest_end.span_s[1]:
+        apart = next((Path(r.topic) for r in used if r.msgtype == POSE_FILE), None)
         found.append(
             f"{latest_start.topic} starts at {latest_start.span_s[0]:.3f} s, after "
             f"{earliest_end.topic} ends at {earliest_end.span_s[1]:.3f} s; if their clocks differ, "
-            f"{advice}"
+            f"{set_to_meet(apart)}"
         )
     return found
 

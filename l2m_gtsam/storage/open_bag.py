@@ -221,14 +221,14 @@ def _check_files(path: Path) -> None:
         if file.suffix in STORED:
             require_regular(file, BagError)
     if not is_bag(path):
-        logs = sorted(each.name for each in path.iterdir() if _may_be_bag(each))
-        there = f"a bag in it is {shown(logs[0])}" if logs else "there is no bag in it"
+        logs = sorted(each.name for each in path.iterdir() if _may_be_log(each))
+        there = f"a log in it is {shown(logs[0])}" if logs else "there is no log in it"
         raise BagError(f"{path}: a folder without {ROS2_HEADER}; {there}; accepted: {ACCEPTED}")
 
 
-def _may_be_bag(path: Path) -> bool:
+def _may_be_log(path: Path) -> bool:
     try:
-        return is_bag(path)
+        return is_bag(path) or path.suffix.lower() in TABLES
     except BagError:  # a folder that cannot be read
         return False
 

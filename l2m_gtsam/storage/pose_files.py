@@ -19,6 +19,10 @@ from l2m_gtsam.storage.units import odd_poses
 NANOSECONDS = 1_000_000_000
 COLUMNS, KITTI_COLUMNS = 8, 12
 LATEST_S = 9_000_000_000  # nanoseconds after it do not fit into 64 bits
+NO_TUM = (
+    "; expected in a line: stamp x y z qx qy qz qw, blanks between; put # before names of columns, "
+    "call a table with commas .csv"
+)
 ROUNDED = 1e-2  # of a rotation matrix: KITTI's have seven digits, those of others often four
 
 
@@ -88,7 +92,7 @@ def read_tum(path: Path) -> Trajectory:
     stamps, rows = list[int](), list[list[float]]()
     for number, words in _lines(path):
         with _at_line(path, number):
-            stamps.append(_seconds(words[0]))
+            stamps.append(_seconds(words[0], NO_TUM))
             rows.append(_pose(words))
     poses = np.array(rows).reshape(-1, COLUMNS - 1)
     return poses_of(path, np.array(stamps, dtype=np.int64), poses[:, :3], poses[:, 3:])
@@ -170,12 +174,12 @@ def _at_line(path: Path, number: int) -> Iterator[None]:
         raise BagError(f"{path}: line {number}: {error}") from error
 
 
-def _seconds(word: str) -> int:
-    """Return seconds, as text, in nanoseconds; ValueError if they are none."""
+def _seconds(word: str, expected: str = "") -> int:
+    """Return seconds, as text, in nanoseconds; a ValueError with what is expected if not."""
     try:
         seconds = Decimal(word)
     except InvalidOperation:
-        raise ValueError(f"{word[:40]!r} is no time in seconds") from None
+        raise ValueError(f"{word[:40]!r} is no time in seconds{expected}") from None
     if not (seconds.is_finite() and 0 <= seconds < LATEST_S):
         raise ValueError(f"{word[:40]!r} is no time in seconds since 1970")
     return round(seconds * NANOSECONDS)

@@ -11,6 +11,7 @@ from l2m_gtsam.data import ScalarSeries
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_options import ColumnOptions, RegressorTopic, Stamps
+from l2m_gtsam.storage.clocks import check_stamps
 from l2m_gtsam.storage.field_types import Step, number_at, steps_of
 from l2m_gtsam.storage.log import Log, Message
 from l2m_gtsam.storage.open_log import open_log
@@ -104,15 +105,11 @@ def _series(path: Path, found: _NumberBuffer) -> ScalarSeries:
     """Return the finite numbers in order of time, the first of each stamp."""
     value = np.array(found.values, dtype=np.float64) * found.options.scale
     stamp_ns = np.array(found.stamp_ns, dtype=np.int64)
-    where = f"{path}: regressor {found.name!r}: topic {found.options.topic}"
-    if len(stamp_ns) and not stamp_ns.any():
-        raise BagError(
-            f"{where}: all header stamps are 0; use the record time instead with "
-            "`bag.stamps: record`"
-        )
+    what = f"regressor {found.name!r}: topic {found.options.topic}"
+    check_stamps(path, what, stamp_ns)
     finite = np.isfinite(value)
     if not finite.any():
-        what = f"no finite {found.options.field!r}" if len(value) else "no messages"
-        raise BagError(f"{where} has {what}")
+        there = f"no finite {found.options.field!r}" if len(value) else "no messages"
+        raise BagError(f"{path}: {what} has {there}")
     stamp_ns, first = np.unique(stamp_ns[finite], return_index=True)
     return ScalarSeries(found.name, found.options.topic, stamp_ns, value[finite][first])

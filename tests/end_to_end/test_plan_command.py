@@ -64,7 +64,13 @@ def test_bad_input(yard: Yard, field_map: Path, tmp_path: Path) -> None:
     assert "nowhere: no such file" in plan(tmp_path / "nowhere", field_map)
     assert "no such map file" in plan(yard.west, tmp_path / "nowhere.npz")
     away = poses_only(tmp_path, route(47.5, 48.5))
-    assert "the map does not cover the drive" in plan(away, field_map)
+    line = plan(away, field_map)
+    assert "the map does not cover the drive" in line
+    assert "is it another place or another map frame?" in line
+    far = ("--map", field_map, "--config", yard.config, "--at", "100,0,0")
+    line = complaint_here("plan", yard.west, *far)
+    assert "covers the drive" in line
+    assert "but no place of a sensor: at 100,0,0 (100, 0, 0)" in line
     config = tmp_path / "c.yaml"
     config.write_text("bag: {poses: /pose}\ncalibration: {start: {mag_9: [0, 0, 0]}}\n")
     assert "no sensor named 'mag_9'; the recording has mag" in plan(yard.west, field_map, config)

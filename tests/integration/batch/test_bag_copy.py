@@ -201,7 +201,7 @@ def test_units_are_those_of_the_calibration_or_of_a_configuration(tmp_path: Path
     np.testing.assert_allclose(calibrated(tmp_path / "out").field, expected, rtol=0, atol=1e-12)
     (tmp_path / "c.yaml").write_text("bag: {units: gauss}")
     applied(tmp_path, bag, config=tmp_path / "c.yaml", out=tmp_path / "again")
-    with pytest.raises(L2MError, match="it is likely gauss: set `bag.units"):
+    with pytest.raises(L2MError, match=r"it is likely gauss: set `bag\.units"):
         applied(tmp_path, bag, out=tmp_path / "third")
     assert not (tmp_path / "third").exists()
 

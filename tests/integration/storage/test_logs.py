@@ -170,7 +170,9 @@ def test_named_columns_and_raw_counts(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"no column with times.*columns.stamp.*raw a"):
         read_fields(path, BagOptions())
     columns = ColumnOptions(stamp="when", fields={"left": ("raw a", "raw b", "raw c")})
-    with pytest.raises(UnitsError, match=r"whole number.*raw counts.*microtesla per count") as error:
+    with pytest.raises(
+        UnitsError, match=r"whole number.*raw counts.*microtesla per count"
+    ) as error:
         read_fields(path, BagOptions(columns=columns))
     assert "milligauss" not in str(error.value)
     (found,) = read_fields(path, BagOptions(columns=columns, units=0.0578))
@@ -336,5 +338,7 @@ def test_poses_of_a_file_beside_a_log(tmp_path: Path) -> None:
     assert found.poses.sha256 in found.origins[0]
     assert inspect_bag(log, options).obstacles == ()
     late = PoseFileOptions(path=tmp_path / "traj.tum", offset_s=1e6)
-    with pytest.raises(BagError, match="different clocks"):
+    with pytest.raises(BagError, match=r"different clocks.*traj.tum with `bag.pose_file.offset_s`"):
         read_recording(log, BagOptions(pose_file=late))
+    (line,) = inspect_bag(log, BagOptions(pose_file=late)).obstacles
+    assert line.endswith(f"to the times of {late.path} with `bag.pose_file.offset_s`")

@@ -138,10 +138,10 @@ def test_readings_are_those_of_each_drive_by_itself(drives: list[Recording]) -> 
 
 
 def test_the_same_way_driven_twice_is_read_twice() -> None:
-    first = drive(GPS, 0)
+    first, later = drive(GPS, 0), drive(2 * GPS, 0)
     field = first.series[0].field + 1.0
-    series = tuple(replace(each, field=field) for each in first.series)
-    again = replace(first, series=series, source=SourceFile("again.bag", "other"))
+    series = tuple(replace(each, field=field) for each in later.series)
+    again = replace(later, series=series, source=SourceFile("again.bag", "other"))
     one = prepare(first, CalibrationOptions()).readings
     both = prepare(joined([first, again]), CalibrationOptions()).readings
     assert len(both) == 2 * len(one)
@@ -193,6 +193,28 @@ def test_one_drive_with_uncertain_poses_leaves_the_other_exact() -> None:
     np.testing.assert_array_equal(uncertain, found.of_drive == 0)
 
 
+def other_sensor(known: Recording, path: str) -> Recording:
+    """Return a drive's table of another sensor that is called the same."""
+    series = tuple(replace(each, field=each.field + 1.0) for each in known.series)
+    return replace(known, series=series, source=SourceFile(path, "other"))
+
+
+def test_parts_of_a_drive_with_one_file_of_poses_are_drives() -> None:
+    whole = drive(GPS, 0)
+    halves = [
+        replace(
+            whole,
+            series=tuple(
+                replace(each, stamp_ns=each.stamp_ns[rows], field=each.field[rows])
+                for each in whole.series
+            ),
+            source=SourceFile(f"{rows}", f"{rows}"),
+        )
+        for rows in (slice(0, 20), slice(20, 40))
+    ]
+    assert len(joined(halves).drives) == 2
+
+
 @pytest.mark.parametrize(
     ("drives", "pattern"),
     [
@@ -201,6 +223,14 @@ def test_one_drive_with_uncertain_poses_leaves_the_other_exact() -> None:
         (
             [drive(0, 0), replace(drive(0, 0), source=SourceFile("copy.mcap", "other"))],
             "0.bag and copy.mcap are the same drive",
+        ),
+        (
+            [drive(0, 0), other_sensor(drive(0, 0), "rear.csv")],
+            "0.bag and rear.csv have the same poses.*: they are one drive, not two; put the read",
+        ),
+        (
+            [drive(0, 0), replace(drive(0, 0, sensors=("left",)), source=SourceFile("l.csv", ""))],
+            "0.bag and l.csv have the same poses.*: they are one drive, not two; put the readings",
         ),
         (
             [drive(0, 0), drive(0, 1, sensors=("left", "right"))],

@@ -105,6 +105,11 @@ def test_other_clocks_are_named_in_one_line() -> None:
     with pytest.raises(SyncError, match=r"drive.bag: .*1700000000.000.*900.000") as error:
         synchronise(recording(poses, series(np.arange(0, 9, 0.5))), KEEP_ALL)
     assert "\n" not in str(error.value)
+    apart = replace(
+        recording(poses, series(np.arange(0, 9, 0.5))), poses=SourceFile("drive.tum", "")
+    )
+    with pytest.raises(SyncError, match=r"`bag.pose_file.offset_s` is added .* of drive.tum$"):
+        synchronise(apart, KEEP_ALL)
 
 
 def test_readings_need_poses_as_far_around_as_their_clock_may_be_off() -> None:

@@ -71,11 +71,14 @@ def test_a_folder_of_a_bag_with_a_pipe(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_no_bag_names_what_is_in_it(tmp_path: Path) -> None:
-    with pytest.raises(L2MError, match=r"without metadata.yaml; there is no bag in it; accepted"):
+    with pytest.raises(L2MError, match=r"without metadata.yaml; there is no log in it; accepted"):
+        opened_log(tmp_path)
+    (tmp_path / "front.csv").touch()
+    with pytest.raises(L2MError, match=r"without metadata.yaml; a log in it is front.csv"):
         opened_log(tmp_path)
     (tmp_path / "day_2.bag").touch()
     (tmp_path / "day_1.mcap").touch()
-    with pytest.raises(L2MError, match=r"without metadata.yaml; a bag in it is day_1.mcap"):
+    with pytest.raises(L2MError, match=r"without metadata.yaml; a log in it is day_1.mcap"):
         opened_log(tmp_path)
 
 
@@ -96,5 +99,12 @@ def test_sizes(tmp_path: Path) -> None:
 def test_what_is_there(tmp_path: Path) -> None:
     assert is_there(tmp_path)
     assert not is_there(tmp_path / "missing")
-    with pytest.raises(OSError, match="is a folder"):
+    with pytest.raises(OSError, match="is a folder; a regular file is expected: "):
         open_regular(tmp_path)
+
+
+def test_a_folder_in_place_of_a_file_is_told_with_what_is_in_it(tmp_path: Path) -> None:
+    for name in ("calibration.yaml", "report.html"):
+        (tmp_path / name).touch()
+    with pytest.raises(L2MError, match=r"is a folder; .*; in it: calibration.yaml, report.html$"):
+        read_content(tmp_path, 1)

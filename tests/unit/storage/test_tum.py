@@ -56,6 +56,11 @@ def test_order_comments_and_repeated_stamps(folder: Path) -> None:
         (f"{LINE}\n1 2 3", "line 2: 3 columns; expected: stamp x y z"),
         (f"{LINE}\nnow 1 2 3 0 0 0 1", "line 2: 'now' is no time"),
         (f"{LINE}\n1e999999999 1 2 3 0 0 0 1", "line 2: '1e999999999' is no time"),
+        (
+            "stamp x y z qx qy qz qw",
+            "line 1: 'stamp' is no time in seconds; expected in a line: st",
+        ),
+        ("1,1,2,3,0,0,0,1", "line 1: '1,1,2,3,0,0,0,1' is no time in seconds; expected in a line"),
         (f"{LINE}\nnan 1 2 3 0 0 0 1", "line 2: 'nan' is no time"),
         (f"{LINE}\n1 1 2 inf 0 0 0 1", "line 2: a number is not finite"),
         (f"{LINE}\n1 1 2 x 0 0 0 1", "line 2: could not convert"),
