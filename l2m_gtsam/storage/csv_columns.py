@@ -44,6 +44,7 @@ STAMPS = (
     *("timestamp", "timestamps", "stamp", "__time"),
 )
 MORE_STAMPS = ("time", "t", "datetime", "seconds_elapsed", "elapsed")
+TIMES = ("time", "datetime", "elapsed")  # last words; t may be a translation
 BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*((?:[^\d\])][^\])]*)?)\s*[\])]\s*$")
 AXIS = re.compile(r"^(.*?)[\s._/\-]*([wxyz])$")
 INDEX = re.compile(r"^(.*?)\[([0-2])\]$")
@@ -114,19 +115,33 @@ def column_roles(names: Sequence[str], options: ColumnOptions, stem: str) -> Rol
     """
     parts = [_parts(name) for name in names]
     stamp, unit = _stamp(names, parts, options)
-    vectors = _vectors(parts)
+    axes_of = _groups(parts, stamp)
+    vectors = {base: axes for base, axes in axes_of.items() if {"x", "y", "z"} <= set(axes)}
     bare = "mag" in stem.lower() or _states_tesla(parts, vectors.get("", {}))
     magnetic = {base: axes for base, axes in vectors.items() if _is_magnetic(base, bare)}
     others = {base: axes for base, axes in vectors.items() if base not in magnetic}
-    orientation = _orientation(names, vectors, options)
-    return Roles(
+    roles = Roles(
         stamp,
         unit if options.time_unit is TimeUnit.AUTO else options.time_unit,
         _fields(names, parts, magnetic, options, stem),
         _position(names, others, options),
-        orientation,
-        _left_out(names, parts, options),
+        _orientation(names, vectors, options),
+        _left_out(names, parts, axes_of, options),
     )
+    _check_stamp(names, roles)
+    return roles
+
+
+def _check_stamp(names: Sequence[str], roles: Roles) -> None:
+    """Raise a ValueError if the options have the times as an axis, too."""
+    fields = [(f"magnetometer {name}", each.columns) for name, each in roles.fields.items()]
+    poses = [("position", roles.position or ()), ("orientation", roles.orientation or ())]
+    for what, columns in [*fields, *poses]:
+        for column in {*roles.stamp} & {*columns}:
+            raise ValueError(
+                f"column {names[column].strip()!r} has the times, it is no axis of the {what}; "
+                "name others with `columns`"
+            )
 
 
 def _parts(name: str) -> Name:
@@ -185,11 +200,14 @@ def _time_unit(name: Name) -> TimeUnit:
 
 
 def _left_out(
-    names: Sequence[str], parts: Sequence[Name], options: ColumnOptions
+    names: Sequence[str],
+    parts: Sequence[Name],
+    groups: Mapping[str, Mapping[str, int]],
+    options: ColumnOptions,
 ) -> tuple[str, ...]:
     if options.fields or options.position or options.orientation:
         return ()  # whoever names columns knows them
-    groups, found = _groups(parts), []
+    found = list[str]()
     texts = {part.text for part in parts}
     turned = any({"x", "y", "z", "w"} <= set(axes) for axes in groups.values())
     for base, axes in groups.items():
@@ -205,15 +223,12 @@ def _left_out(
     return tuple(found)
 
 
-def _vectors(parts: Sequence[Name]) -> dict[str, dict[str, int]]:
-    """Return columns by what stands before their axis, and the axis, where none is missing."""
-    return {base: axes for base, axes in _groups(parts).items() if {"x", "y", "z"} <= set(axes)}
-
-
-def _groups(parts: Sequence[Name]) -> dict[str, dict[str, int]]:
-    """Return columns by what stands before their axis, and the axis."""
+def _groups(parts: Sequence[Name], stamp: tuple[int, ...]) -> dict[str, dict[str, int]]:
+    """Return columns, but those of the times, by what stands before their axis, and the axis."""
     found: dict[str, dict[str, int]] = {}
     for k, part in enumerate(parts):
+        if k in stamp:
+            continue
         if match := INDEX.match(part.text):
             found.setdefault(match[1], {}).setdefault("xyz"[int(match[2])], k)
         elif match := AXIS.match(_without_unit(part.text)):
@@ -256,7 +271,7 @@ def _fields(
 
 def _is_magnetic(base: str, bare: bool) -> bool:
     """Return whether a name is that of a magnetometer; of columns x, y and z alone it is given."""
-    if "cov" in base:
+    if "cov" in base or base.endswith(STAMPS) or _last(base) in TIMES:
         return False
     if base == "":
         return bare
