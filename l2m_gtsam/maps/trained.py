@@ -173,7 +173,7 @@ class GPMap(ABC, Generic[AnyGPOptions]):
                 "length scale (m)": known.length_scale,
                 "signal (uT)": known.signal,
                 "noise of a reading (uT)": known.noise,
-                "hyperparameters": "given" if learning is None else describe(learning),
+                "hyperparameters": _described(learning),
                 **self.facts,
             },
         )
@@ -319,8 +319,14 @@ def first_complaint(error: ValidationError) -> str:
     return f"{where}: {what}" if where else what
 
 
-def describe(learning: LikelihoodFit) -> str:
-    """Return how learning ended in a few words."""
-    if learning.at_bound:
-        return f"learnt, not determined by the data: {', '.join(learning.at_bound)}"
-    return "learnt" if learning.converged else f"learnt, not converged: {learning.message}"
+def _described(learning: LikelihoodFit | None) -> str:
+    if learning is None:
+        return "given"
+    return learning_words(learning.converged, learning.at_bound, learning.message)
+
+
+def learning_words(converged: bool, at_bound: tuple[str, ...], message: str = "") -> str:
+    """Return how learning ended, in a few words and those of the optimiser."""
+    if at_bound:
+        return f"learnt, not determined by the data: {', '.join(at_bound)}"
+    return "learnt" if converged else f"learnt, search stopped early{message and f': {message}'}"

@@ -112,23 +112,11 @@ def read_metrics(path: Path) -> Metrics:
 
 
 def write_validation(path: Path, validation: Validation) -> str:
-    """Write ``validation.json`` and return its id; `read_validation` gives it back equal."""
+    """Write ``validation.json`` and return its id."""
     file = _ValidationFile("l2m-validation", 1, validation)
     found = report_id(json.loads(_VALIDATION.dump_json(file, by_alias=True)))
     _write(path, _VALIDATION.dump_json(replace(file, id=found), by_alias=True))
     return found
-
-
-def read_validation(path: Path) -> Validation:
-    """Return the validation in a file.
-
-    Raises
-    ------
-    CalibrationError
-        The file is missing, damaged or something else.
-    """
-    writer = "`l2m validate --out` writes it"
-    return _read(path, _VALIDATION, "validation", writer).validation
 
 
 def write_slam(path: Path, record: LocalisationRecord) -> str:

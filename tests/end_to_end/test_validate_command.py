@@ -12,11 +12,11 @@ from l2m_gtsam.batch.validation import ValidationRequest, validate_calibration
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration
-from l2m_gtsam.storage.record_files import read_validation
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
 from tests.drives.yard import CalibratedYard, H, written
 from tests.support.command_line import complaint_here, l2m
 from tests.support.map_files import copy_map
+from tests.support.records import validation_in
 from tests.worlds.yard import NOISE
 
 
@@ -60,7 +60,7 @@ def test_the_commands_of_the_page_run(
     assert "offset H differs from the calibration" not in on_drive
     assert "No change since the old calibration" in compared
     assert "No change since the old calibration" in both
-    found = read_validation(Path("validated/validation.json"))
+    found = validation_in(Path("validated/validation.json"))
     assert found.drive is not None
     assert found.comparison is None
     (sensor,) = found.drive.sensors
@@ -106,7 +106,7 @@ def test_a_magnet_on_the_vehicle_is_named(
     told = "\n".join(found.verdict.lines(Level.PASS))
     assert "verdict: FAIL" in told
     assert "On this drive its offset H differs from the calibration by 3.0 µT" in told
-    assert read_validation(tmp_path / "out" / "validation.json").verdict == found.verdict
+    assert validation_in(tmp_path / "out" / "validation.json").verdict == found.verdict
     assert {each.role for each in found.sources} == {"calibration", "drive", "map"}
 
 

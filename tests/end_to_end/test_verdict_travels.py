@@ -23,10 +23,10 @@ from l2m_gtsam.storage.calibrated_topics import VERDICT_TOPIC
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
 from l2m_gtsam.storage.open_bag import open_bag
-from l2m_gtsam.storage.record_files import read_validation
 from tests.drives.yard import CalibratedYard, written
 from tests.support.command_line import Finished, ended, l2m, one_line
 from tests.support.one_process import computed_here
+from tests.support.records import validation_in
 
 pytestmark = pytest.mark.usefixtures("without_pages", "texts_read_once")
 
@@ -302,7 +302,7 @@ def test_what_a_failed_calibration_was_used_for_says_so(
     l2m("validate", drive, *files, "--out", folder / "valid")
     l2m("validate", *files[:2], "--compare", place.calibration, "--out", folder / "compared")
     for name in ("valid", "compared"):
-        verdict = read_validation(folder / name / "validation.json").verdict
+        verdict = validation_in(folder / name / "validation.json").verdict
         assert any("judged FAIL" in each.text for each in verdict.reasons)
         assert verdict.level is not Level.PASS
     common = ("--config", failed.config, "--out", folder / "path")

@@ -14,7 +14,7 @@ from l2m_gtsam.storage.cloud import read_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, read_cloud_topic
 from l2m_gtsam.storage.drive_lists import read_manifest
 from l2m_gtsam.storage.listed_sensors import read_sensors
-from l2m_gtsam.storage.record_files import read_outcome, read_validation
+from l2m_gtsam.storage.record_files import read_outcome
 from l2m_gtsam.studies.registry import STUDIES
 
 
@@ -31,7 +31,6 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "sensors": read_sensors,
     "scans": _scans,
     "outcome": read_outcome,
-    "validation": read_validation,
     **{
         f"study {name}": partial(load_options, model=study.options)
         for name, study in STUDIES.items()

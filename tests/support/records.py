@@ -1,6 +1,19 @@
-"""Comparison of records."""
+"""Comparison of records, and those that the program writes and does not read."""
+
+import json
+from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
+
+from l2m_gtsam.records.validation import Validation
+
+VALIDATION = TypeAdapter(Validation)
+
+
+def validation_in(path: Path) -> Validation:
+    """Return the validation in a ``validation.json``."""
+    return VALIDATION.validate_json(json.dumps(json.loads(path.read_text())["validation"]))
 
 
 def assert_equal(a: object, b: object) -> None:

@@ -25,6 +25,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
     surveyed_area,
     tiling_of,
 )
+from l2m_gtsam.maps.trained import learning_words
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import in_threads
@@ -81,9 +82,7 @@ class LearningEnd:
         """In a few words."""
         if self.log_likelihood is None:
             return "given"
-        if self.at_bound:
-            return f"learnt, not determined by the data: {', '.join(self.at_bound)}"
-        return "learnt" if self.converged else "learnt, search stopped early"
+        return learning_words(self.converged, self.at_bound)
 
 
 @dataclass(frozen=True)

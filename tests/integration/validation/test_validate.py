@@ -24,7 +24,7 @@ from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.sensor_models import MovingField
 from l2m_gtsam.records.validation import CalibrationPart, DriveValidation, Validation
 from l2m_gtsam.records.verdict import Level, Verdict
-from l2m_gtsam.storage.record_files import read_validation, write_validation
+from l2m_gtsam.storage.record_files import write_validation
 from l2m_gtsam.studies.validation.drives import (
     TrueCause,
     ValidationStudyOptions,
@@ -36,6 +36,7 @@ from tests.drives.calibrations import unsolved
 from tests.drives.degenerate import STRONG
 from tests.drives.validation import MAP, OPTIONS, calibrated, changed, loops, other_drive
 from tests.drives.verdict import NOISE, NOMINAL, SENSORS, drive
+from tests.support.records import validation_in
 from tests.worlds.exact import DipoleWorld, dipole_world
 
 # These drives show changes of a place from 31 mm on.
@@ -386,7 +387,7 @@ def whole() -> Validation:
 
 def test_a_validation_comes_back_as_it_was(whole: Validation, tmp_path: Path) -> None:
     write_validation(tmp_path / "first.json", whole)
-    back = read_validation(tmp_path / "first.json")
+    back = validation_in(tmp_path / "first.json")
     write_validation(tmp_path / "second.json", back)
     assert (tmp_path / "first.json").read_bytes() == (tmp_path / "second.json").read_bytes()
 
@@ -398,7 +399,7 @@ def test_what_changed_at_the_place_comes_back(whole: Validation, tmp_path: Path)
     assert whole.drive is not None
     drive = replace(whole.drive, sources=(source,), explanations=told)
     write_validation(tmp_path / "first.json", replace(whole, drive=drive))
-    back = read_validation(tmp_path / "first.json").drive
+    back = validation_in(tmp_path / "first.json").drive
     assert back is not None
     assert back.explanations == told
     np.testing.assert_array_equal(back.sources[0].moment, source.moment)
@@ -412,21 +413,4 @@ def test_keys_of_the_file_are_those_of_earlier_versions(whole: Validation, tmp_p
     assert set(content["verdict"]["sensors"][0]) == {"sensor", "level", "remarks"}
     assert set(content["verdict"]["sensors"][0]["remarks"][0]) == {"level", "text"}
     assert "noticeable" in content["drive"]["sensors"][0]
-    assert read_validation(path).verdict == whole.verdict
-
-
-@pytest.mark.parametrize(
-    ("content", "complaint"),
-    [
-        ("{}", "format"),
-        ("not json", "not a validation file"),
-        ('{"format": "x"}', "form"),
-    ],
-)
-def test_other_files_are_refused(content: str, complaint: str, tmp_path: Path) -> None:
-    path = tmp_path / "validation.json"
-    path.write_text(content)
-    with pytest.raises(CalibrationError, match=complaint):
-        read_validation(path)
-    with pytest.raises(CalibrationError, match="no such file"):
-        read_validation(tmp_path / "none.json")
+    assert validation_in(path).verdict == whole.verdict
