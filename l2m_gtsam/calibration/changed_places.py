@@ -146,6 +146,8 @@ def search(
     """
     if not options.sources.most or not isinstance(field_map, UncertainMap):
         return None
+    if solution.contradicted:  # no place is as the map has it
+        return None
     # A sensor with a dead axis does not say what the field is.
     whole = np.linalg.cond(solution.estimate.C()) < SINGULAR
     sensors = tuple(each for each in solution.placed if whole[each])

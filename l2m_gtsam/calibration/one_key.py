@@ -25,6 +25,7 @@ from l2m_gtsam.calibration.alternation import (
     start_estimate,
 )
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
+from l2m_gtsam.calibration.contradiction import is_contradicted
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import (
@@ -114,6 +115,9 @@ class OneKeySolution:
         As of ``UncertainSolution``.
     stayed
         Sensors that the solve drives out of the map: they are where they started.
+    contradicted
+        Whether readings contradict the map: what it predicts is not in them. Errors that it shares
+        are not looked for then.
     """
 
     readings: Readings
@@ -131,6 +135,7 @@ class OneKeySolution:
     by_parts: tuple[ByParts, ...] = ()
     unseen_warp_m: float | None = None
     stayed: frozenset[int] = frozenset()
+    contradicted: bool = False
 
     @property
     def used(self) -> BoolArray:
@@ -285,9 +290,10 @@ def _solved(
         return outcome
     view, tests = joint.problem.view, joint.problem.determinacies
     errors = shared_errors(field_map, view.readings, options.uncertainty)
-    if errors is None:
-        found = finish.independent(joint.problem, joint.estimate)
-        return replace(outcome, solved=in_order(found, alone.solved))
+    contradicted = is_contradicted(view, joint.estimate, tests)
+    if errors is None or contradicted:
+        found = in_order(finish.independent(joint.problem, joint.estimate), alone.solved)
+        return replace(outcome, solved=found, contradicted=contradicted)
     if duration := duration_of_poses(
         view, field_map, joint.estimate, options.pose_noise, trajectory
     ):

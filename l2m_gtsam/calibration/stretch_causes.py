@@ -51,11 +51,14 @@ def with_causes(
     solution
         The solve.
     field_map
-        The map that it was solved on; one that does not know its errors explains nothing.
+        The map that it was solved on; one that does not know its errors, or is contradicted,
+        explains nothing.
     options
         How readings are averaged.
     """
     if not stretches or not isinstance(field_map, UncertainMap) or not is_place_of(field_map):
+        return stretches
+    if solution.contradicted:
         return stretches
     solved = [each.sensor for each in solution.solved]
     drive = averaged_drive(solution, solved, field_map, options.averaging)

@@ -276,3 +276,14 @@ def _solve_ridge(X: FloatArray, Y: FloatArray, strength: float) -> FloatArray:
     regressors = np.vstack([X, np.sqrt(strength) * np.eye(3)])
     observations = np.vstack([Y, np.zeros((3, 3))])
     return np.asarray(np.linalg.lstsq(regressors, observations, rcond=1e-12)[0])
+
+
+def refitted(b_lidar: FloatArray, readings: FloatArray) -> float:
+    """Return what any C and H leave of readings at fields ``b_lidar``, per axis, rms in uT.
+
+    Both have the shape (N, 3).
+    """
+    A: FloatArray = np.column_stack([b_lidar, np.ones(len(b_lidar))])
+    # A vehicle that keeps its heading leaves columns alike; least squares takes the shortest then.
+    solution = np.linalg.lstsq(A, readings, rcond=None)[0]
+    return float(np.sqrt(np.mean((A @ solution - readings) ** 2)))

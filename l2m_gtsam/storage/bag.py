@@ -13,6 +13,7 @@ from l2m_gtsam.data import FieldSeries, Recording, Trajectory
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.geometry import moved
 from l2m_gtsam.progress import Count
+from l2m_gtsam.recording.pose_order import order_notes
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps, TfChain
 from l2m_gtsam.storage.clocks import check_clocks, check_stamps, clock_notes
 from l2m_gtsam.storage.field_types import FieldSource, is_field
@@ -82,6 +83,7 @@ def read_recording(path: Path, options: BagOptions, progress: Count | None = Non
     trajectory = _trajectory(path, buffers, options, paths)
     check_clocks(path, trajectory, series, apart)
     notes, origins = _clocks(path, buffers, options), tuple[str, ...]()
+    notes += order_notes(apart or path, trajectory)
     source = None if apart is None else source_file(apart)
     if source is not None:
         origins = (f"{path}: poses are those of {source.path} (sha256 {source.sha256})",)

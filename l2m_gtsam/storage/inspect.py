@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Connection
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.progress import Count
+from l2m_gtsam.recording.pose_order import order_notes
 from l2m_gtsam.recording.saturation import saturated_axes, saturation_sentence
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps
 from l2m_gtsam.storage.bag_report import POSE_FILE, BagReport, TopicReport
@@ -93,7 +94,9 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
         notes.append(f"{no_poses}; {BY_CLOUDS}")
         no_poses = ""
     if apart is not None:
-        reports.append(_pose_file(apart, options))
+        found = read_poses(apart, options.pose_file)
+        reports.append(_pose_file(apart, found, options))
+        notes += order_notes(apart, found)
     obstacles = [reason for reason in (no_fields, no_poses) if reason]
     obstacles += [f"{r.topic}: {r.use}" for r in reports if "refused" in r.use and r.topic in uses]
     used = [collected.get(each.connection.topic) for each in fields]
@@ -102,8 +105,8 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
     # a static transform holds from any time on
     timed = [r for r in reports if r.topic in uses or r.msgtype == POSE_FILE]
     timed = [r for r in timed if "tf_static" not in r.topic]
-    found = (*obstacles, *_clock_obstacles(timed, options))
-    return BagReport(path, tuple(reports), found, tuple(notes))
+    obstacles += _clock_obstacles(timed, options)
+    return BagReport(path, tuple(reports), tuple(obstacles), tuple(notes))
 
 
 def _judged_poses(
@@ -122,9 +125,8 @@ def _judged_poses(
     ]
 
 
-def _pose_file(path: Path, options: BagOptions) -> TopicReport:
+def _pose_file(path: Path, found: Trajectory, options: BagOptions) -> TopicReport:
     """Return what is known of a file with the poses."""
-    found = read_poses(path, options.pose_file)
     gaps = np.diff(found.stamp_ns).astype(np.float64) * 1e-9
     return TopicReport(
         topic=str(path),

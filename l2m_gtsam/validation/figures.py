@@ -10,7 +10,7 @@ from l2m_gtsam.data import IntArray, SourceFile, same_content
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.qa.metrics.changes import change_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
-from l2m_gtsam.qa.metrics.fit import curves, field_error, fit_figures, refitted, series
+from l2m_gtsam.qa.metrics.fit import curves, field_error, fit_figures, series
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     SensorCalibration,
@@ -24,6 +24,7 @@ from l2m_gtsam.records.validation import (
     ValidatedSensor,
 )
 from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.solve.closed_form import refitted
 from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, columns_of, width
 from l2m_gtsam.validation.innovation import detectable_change, knows_its_errors
 from l2m_gtsam.validation.recheck import Recheck, SensorDrive

@@ -113,6 +113,8 @@ class ErrorModes:
 
     def owner(self, points: FloatArray) -> IntArray:
         """Return the tile whose beta act at each point: of those with modes the nearest, (N,)."""
+        if not len(points):  # then no tile has modes
+            return np.empty(0, dtype=np.int64)
         known = np.array(list(self.tiles))
         near = Grid(self.grid.origin, self.grid.size, self.grid.cells[known])
         return np.asarray(known[near.block_of(points)])

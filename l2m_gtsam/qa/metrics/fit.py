@@ -11,6 +11,7 @@ from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.metrics import Autocorrelation, CurveErrors, FitFigures, Normalised, Series
 from l2m_gtsam.records.validation import FieldError
 from l2m_gtsam.solve.chi_square import quantile
+from l2m_gtsam.solve.closed_form import refitted
 
 BINS = 24
 LAGS = 40
@@ -113,17 +114,6 @@ def field_error(field: FloatArray, of_map: FloatArray) -> FieldError:
         mean_axes=row(difference.mean(axis=0)),
         std_axes=row(difference.std(axis=0)),
     )
-
-
-def refitted(b_lidar: FloatArray, readings: FloatArray) -> float:
-    """Return what any C and H leave of readings at fields ``b_lidar``, per axis, rms in uT.
-
-    Both have the shape (N, 3).
-    """
-    A: FloatArray = np.column_stack([b_lidar, np.ones(len(b_lidar))])
-    # A vehicle that keeps its heading leaves columns alike; least squares takes the shortest then.
-    solution = np.linalg.lstsq(A, readings, rcond=None)[0]
-    return float(np.sqrt(np.mean((A @ solution - readings) ** 2)))
 
 
 @dataclass(frozen=True)
