@@ -199,6 +199,11 @@ class SavedMap:
         return entries if isinstance(entries, list) else []
 
 
+def map_notes(saved: SavedMap, field_map: FieldMap) -> tuple[str, ...]:
+    """Return what whoever uses a map has to know of it, by itself and by its file, as notes."""
+    return tuple(f"Of the map: {doubt}" for doubt in (*field_map.summary.doubts, *saved.doubts))
+
+
 def used_file(path: Path, judgement: Level | None) -> dict[str, Any]:
     """Return what a map's file says of a calibration that it was made with."""
     verdict = {"verdict": Level.FAIL.value} if judgement is Level.FAIL else {}

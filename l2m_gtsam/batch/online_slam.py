@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.batch.files import SavedMap, ensure_folder
+from l2m_gtsam.batch.files import SavedMap, ensure_folder, map_notes
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow
 from l2m_gtsam.batch.slam import (
@@ -163,7 +163,10 @@ def slam_online(
         None
         if truth is None
         else _compared(truth, trajectory, recording, config, from_first=from_first),
-        calibration_notes(given.calibration, calibration),
+        (
+            *calibration_notes(given.calibration, calibration),
+            *(() if saved is None or field_map is None else map_notes(saved, field_map)),
+        ),
     )
 
 

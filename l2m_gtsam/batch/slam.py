@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from l2m_gtsam.batch.drives import METRICS_FILE
-from l2m_gtsam.batch.files import SavedMap, check_outputs
+from l2m_gtsam.batch.files import SavedMap, check_outputs, map_notes
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.reports import REPORT_FILE, SLAM_FILE, write_slam_report
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow, scan_start
@@ -238,7 +238,8 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     else:
         found = _localised(recording, calibration, saved, scanned.evidence, config, progress)
     used = calibration_notes(given.calibration, calibration)
-    notes = (*used, *scanned.notes, *found.result.notes)
+    doubted = () if saved is None else map_notes(saved, found.field_map)
+    notes = (*used, *doubted, *scanned.notes, *found.result.notes)
     result = replace(found.result, map=map_source, calibration_source=calibration_source)
     found = replace(found, result=replace(result, notes=notes))
     options = config.model_dump(mode="json", include={"bag", "lidar", "slam", "qa"})

@@ -75,7 +75,10 @@ def test_places_belong_to_the_nearest_tile_with_modes(
 
 
 def test_no_places_have_no_errors(harmonic: HarmonicMap) -> None:
-    assert harmonic.errors_over(np.empty((0, 3))).covariance.shape == (0, 0)
+    nowhere = np.empty((0, 3))
+    found = harmonic.errors_over(nowhere)
+    assert found.covariance.shape == (0, 0)
+    assert found.owner(nowhere).shape == (0,)
 
 
 def noise_errors(

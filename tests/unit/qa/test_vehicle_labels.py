@@ -8,7 +8,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Annotation, Text
 
-from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.data import FloatArray, SourceFile, Trajectory
 from l2m_gtsam.qa.report.figures.names import MOST_NAMES
 from l2m_gtsam.qa.report.figures.vehicle import (
     SIDE,
@@ -67,6 +67,22 @@ DRIVE = Trajectory(np.arange(3), np.tile(np.eye(3), (3, 1, 1)), np.eye(3), "map"
 PAIRS = np.array(
     [(x, s * 0.4, z + s * 0.01) for x in (-0.4, 0.4) for z in (-0.3, -0.1) for s in (-1, 1)]
 )
+
+
+@pytest.mark.parametrize(
+    ("bags", "drives", "expected"),
+    [
+        ((), 1, ["drive of the lidar"]),
+        (("day/a.bag", "day/$\\b$.bag"), 2, ["drive 1: a.bag", "drive 2: $\\b$.bag"]),
+        (tuple(f"{k}.bag" for k in range(9)), 9, ["drives of the lidar"]),
+    ],
+)
+def test_the_legend_names_drives(bags: tuple[str, ...], drives: int, expected: list[str]) -> None:
+    result = replace(calibration(PAIRS), bags=tuple(SourceFile(each, "") for each in bags))
+    picture = read_metrics(REPOSITORY / "tests" / "files" / "metrics.json").map
+    legend = calibration_figure(picture, [DRIVE] * drives, result, ()).axes[0].get_legend()
+    assert legend is not None
+    assert [each.get_text() for each in legend.get_texts()] == expected
 
 
 @pytest.mark.parametrize("overview", [False, True])

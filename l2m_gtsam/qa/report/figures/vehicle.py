@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,10 +27,12 @@ from l2m_gtsam.qa.report.svg import (
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import MapPicture
 from l2m_gtsam.records.verdict import Level, Verdict
-from l2m_gtsam.text import with_sigma
+from l2m_gtsam.text import shown, with_sigma
 
 SIGMAS_95 = 5.991**0.5  # half axes that hold 95 %: root of the quantile of chi-square of two
 ESTIMATE, TRUTH = "#d55e00", "black"  # vermilion and black differ for all kinds of colour vision
+DRIVES = (ESTIMATE, "#cc79a7", "black", "#56b4e9")  # of as many drives as a legend has room for
+LONGEST = 40  # letters of a drive's name
 COLOURS = {Level.PASS: GOOD, Level.WARN: FAIR, Level.FAIL: BAD}
 SHAPES = {Level.PASS: "o", Level.WARN: "^", Level.FAIL: "X"}
 # An ellipse that is less than this share of the picture is a dot: all are drawn larger then.
@@ -188,12 +191,15 @@ def calibration_figure(
     strength, label = np.array(picture.strength), "field strength (uT)"
     draw_map(figure, place, strength, picture.extent, label, "viridis", shrink=0.8)
     place.set_facecolor("0.93")
-    for k, drive in enumerate(drives):
-        label = "_" if k else "drive of the lidar"  # one entry in the legend
+    labels = _drive_labels([Path(each.path).name for each in result.bags], len(drives))
+    for k, (drive, name) in enumerate(zip(drives, labels, strict=True)):
+        colour = DRIVES[k % len(DRIVES)]
         place.plot(*drive.p[:, :2].T, color="white", linewidth=2.2)
-        place.plot(*drive.p[:, :2].T, color=ESTIMATE, linewidth=1.0, label=label)
+        place.plot(*drive.p[:, :2].T, color=colour, linewidth=1.0, label=name)
     place.set_title(f"map at z = {picture.height:.2f} m", loc="right")
-    place.legend(loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
+    known = place.legend(loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False, fontsize="small")
+    for words in known.get_texts():
+        words.set_parse_math(False)  # the figure is laid out with names of files in it
     solved = [s for s in result.sensors if s.residuals is not None]
     factor = enlargement(solved, TOP)
     _draw_vehicle(above, solved, truth, TOP, factor)
@@ -205,6 +211,15 @@ def calibration_figure(
     for axes, view in ((above, TOP), (side, SIDE)):
         _name(axes, solved, view)
     return figure
+
+
+def _drive_labels(names: Sequence[str], count: int) -> list[str]:
+    """Return what the legend calls each drive; with too many for it all have one entry."""
+    if count == 1:
+        return ["drive of the lidar"]
+    if len(names) != count or count > len(DRIVES):
+        return ["drives of the lidar", *["_"] * (count - 1)]
+    return [f"drive {k}: {shown(name, LONGEST)}" for k, name in enumerate(names, start=1)]
 
 
 def _draw_vehicle(
