@@ -74,6 +74,11 @@ def test_a_drive_is_localised(yard: Yard, field_map: Path, known: Path, tmp_path
         run = l2m("slam", yard.west, *files, "--truth", truth)
     assert "localised: the map explains" in run.out
     assert "verdict: " in run.out
+    doubts = [
+        line for line in l2m("map", "info", field_map).err.splitlines() if "warning: " in line
+    ]
+    assert doubts
+    assert all(f"Of the map: {each.partition('warning: ')[2]}" in run.out for each in doubts)
     told = json.loads((out / "slam.json").read_text())
     assert told["status"] == "localised"
     trajectory = file_interface.read_tum_trajectory_file(str(out / "trajectory.tum"))

@@ -118,6 +118,7 @@ def test_the_page_has_all_that_a_person_looks_for(reported: tuple[Level, str]) -
         "The environment has changed",
         "Scale per axis",
         "Hard iron",
+        "° about the axis that is known least",
         "Angles between its axes",
         "What its sigmas rest on",
         "Before, after, map",
