@@ -10,6 +10,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.determined import TIME_OFFSET
+from l2m_gtsam.calibration.even_field import shows_no_place
 from l2m_gtsam.calibration.forecast import rank_tests
 from l2m_gtsam.calibration.joint import SensorSolution, with_infinities
 from l2m_gtsam.calibration.one_key import OneKeySolution
@@ -17,6 +18,12 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.explain import drive_facts, explain, held_offset
 from l2m_gtsam.solve.rank import PARAMETERS, Determinacy, RankOptions
+
+OF_PLACE = slice(0, 3)
+EVEN = (
+    "position (t_x, t_y, t_z): a field that is the same everywhere explains the readings as well; "
+    "drive where the field varies more"
+)
 
 
 @dataclass(frozen=True)
@@ -75,6 +82,10 @@ def explained(
         if (after.touched & ~before.touched).any():
             words += undetermined(after, own, solution.estimate.t[s], field_map, options.rank)
         open_ = replace(before, offset=after.offset)
+        held = not (before.touched | after.touched)[OF_PLACE].any() and not priors.each
+        if held and shows_no_place(own, field_map, solution.estimate.t[s]):
+            words += (EVEN,)
+            open_ = replace(open_, touched=open_.touched | (np.arange(len(PARAMETERS)) < 3))
         covariance = with_infinities(found.joint_covariance, open_)
         found = replace(found, joint_covariance=covariance)
         explanations[s] = Explained(found, words, held_offset(after), from_priors(before, after))

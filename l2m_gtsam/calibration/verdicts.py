@@ -245,12 +245,14 @@ def _verdict(
             f"{because}its clock seems to be off by {options.largest_offset_s:g} s or more: "
             "correct its stamps, or raise `calibration.solve.largest_offset_s`"
         )
-    if found.sensor in solution.unsettled:
+    # A place that nothing holds need not come to rest: that it is open says it all.
+    placeless = bool(np.isinf(np.diag(found.covariance)[:3]).all())
+    if found.sensor in solution.unsettled and not placeless:
         return SensorStatus.NOT_CONVERGED, (
             f"{because}estimate and weights still change, round after round"
         )
     runs_away = found.sensor in solution.stayed
-    if found.remaining_sigmas > CONVERGED_SIGMAS and not runs_away:
+    if found.remaining_sigmas > CONVERGED_SIGMAS and not (runs_away or placeless):
         return SensorStatus.NOT_CONVERGED, (
             f"{because}{solution.ending.value}, {found.remaining_sigmas:.2g} standard deviations "
             "from the optimum"

@@ -28,6 +28,7 @@ HEADS = {
     SensorStatus.FLIPPED_AXIS: "An axis is reversed",
 }
 WORSE = 1.5  # of what a uniform field leaves of the readings: the map contradicts them
+CHANCE_SIGMAS = 4.0  # of a correlation of N readings, which by chance is 1 / sqrt(N)
 WRONG_MAP = (
     "The map does not fit this drive: a field that is the same everywhere explains the readings as "
     "well. Is it the map of this place, and are the poses in its frame?"
@@ -164,8 +165,10 @@ def _explained(case: Case) -> list[Reason]:
     if case.metrics is None:
         return []
     found = case.metrics.fit
-    # Where the place is open, the field is too uniform to test the map, unless that is worse.
-    if not np.isfinite(case.sensor.t_sigma).all() and not found.unexplained > WORSE:
+    # Where the place is open, the field is too uniform to test the map, unless that is worse. So
+    # it is where what the map leaves is noise, from one reading to the next.
+    even = not np.isfinite(case.sensor.t_sigma).all() or _leaves_noise(case.metrics)
+    if even and not found.unexplained > WORSE:
         return []
     text = (
         f"The map leaves {significant(found.left, 2)} µT of its readings unexplained, a field that "
@@ -179,6 +182,14 @@ def _explained(case: Case) -> list[Reason]:
     else:
         text += "it explains less than a map of this place should."
     return case.options.unexplained.reasons(found.unexplained, text)
+
+
+def _leaves_noise(metrics: SensorMetrics) -> bool:
+    """Return whether what is left of neighbouring readings is no more alike than chance makes it.
+
+    Of a map that is wrong neighbours have much the same left.
+    """
+    return bool(metrics.autocorrelation.next < CHANCE_SIGMAS / np.sqrt(metrics.fit.readings))
 
 
 def _consistent(case: Case) -> list[Reason]:

@@ -5,11 +5,16 @@ import pytest
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrate
+from l2m_gtsam.calibration.calibrate import calibrated as calibrate_and_keep
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.planning.plan import plan
+from l2m_gtsam.qa.evaluate import evaluate
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.calibration import judge
+from l2m_gtsam.qa.verdict.sensor import WRONG_MAP
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
 from l2m_gtsam.records.plan import DrivePlan
 from tests.drives.degenerate import (
@@ -27,6 +32,8 @@ from tests.drives.degenerate import (
     recorded,
     straight,
 )
+from tests.drives.verdict import drive
+from tests.worlds.exact import DipoleWorld
 
 SOLVE = OneKeyOptions(sensor_noise_ut=NOISE)
 OPEN = (SensorStatus.UNDETERMINED, SensorStatus.NOT_CONVERGED)
@@ -181,3 +188,22 @@ def test_the_motion_that_is_missing_helps_most() -> None:
     assert best.worst.undetermined == 3
     again = next(each for each in found.motions if each.motion == "the same drive once more")
     assert again.worst.undetermined == 9
+
+
+@pytest.mark.parametrize("share", [0.003, 0.006, 0.01])
+def test_noise_holds_no_sensor(share: float) -> None:
+    """In a nearly even field the search ends anywhere, with gradients that would determine t.
+
+    No sigma is finite that is wrong, and nobody says that the map is of another place.
+    """
+    place = DipoleWorld(STRONG.uniform, STRONG.positions, share * STRONG.moments)
+    whole = drive(place=place, field_map=place)
+    searched = CalibrationOptions()
+    found = calibrate_and_keep(whole.recording, place, searched)
+    for sensor in found.result.sensors:
+        assert sensor.status is SensorStatus.UNDETERMINED
+        assert np.isinf(sensor.t_sigma).all()
+        assert np.isfinite(sensor.H_sigma[:2]).all()
+    qa = QaOptions(halves=False)
+    metrics = evaluate(whole.recording, found, searched, qa)
+    assert WRONG_MAP not in [each.text for each in judge(found.result, metrics, qa).reasons]
