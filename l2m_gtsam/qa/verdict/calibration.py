@@ -39,6 +39,10 @@ LOWER_BOUNDS = (
     "Its sigmas are lower bounds: they count errors of the map as each reading's own, though "
     "readings near each other share them. Use a harmonic map, with `uncertainty: full`."
 )
+COMMON = (
+    "What all sensors of the survey are off by together need not show: it goes one to one into "
+    "every t and rotation."
+)
 MANY = 4  # stretches that are listed one by one
 
 
@@ -125,7 +129,9 @@ def _exact(result: CalibrationResult) -> list[Reason]:
         )
         reasons.append(Reason(Level.PASS, text))
     if result.exact:
-        reasons.append(Reason(Level.PASS, f"Taken as exact: {', '.join(result.exact)}."))
+        common = f" {COMMON}" if "the survey's sensors" in result.exact else ""
+        text = f"Taken as exact: {', '.join(result.exact)}.{common}"
+        reasons.append(Reason(Level.PASS, text))
     return reasons
 
 

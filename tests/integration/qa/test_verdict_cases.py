@@ -251,3 +251,10 @@ def test_wrong_units_are_caught_before(tmp_path: Path) -> None:
 
 def test_the_sensors_are_where_the_cases_say() -> None:
     assert {each.sensor: tuple(each.t_lidar_mag) for each in SENSORS} == NOMINAL
+
+
+def test_what_is_taken_for_exact_says_what_follows() -> None:
+    """No sigma knows of a suite that is off as a whole, and no drive shows it."""
+    (note,) = [each for each in verdict_on(good).reasons if "Taken as exact" in each.text]
+    assert note.level is PASS
+    assert "one to one into every t and rotation" in note.text
