@@ -109,7 +109,7 @@ class CalibrationChange(Record):
 
 @dataclass(frozen=True)
 class MinimumDetectableChange(Record):
-    """The smallest change of a part, all others as calibrated, that a drive surely shows.
+    """The smallest change of a part that surely shows: on a drive, all others as calibrated.
 
     Five standard deviations, in the units of ``CalibrationChange``; infinite where it shows none.
     """
@@ -150,6 +150,9 @@ class ValidatedSensor(Record):
         The course of the drive, thinned.
     limits
         Of its range, that readings exceed; these do not count.
+    reads_as
+        The sensor whose calibration its readings fit, and all figures here are of, where the two
+        are exchanged; empty where it is its own.
     """
 
     sensor: str
@@ -174,6 +177,7 @@ class ValidatedSensor(Record):
     ]
     series: Series
     limits: tuple[SaturatedAxis, ...] = ()
+    reads_as: str = ""
 
     @property
     def unexplained(self) -> float:
@@ -200,6 +204,61 @@ class NotValidated(Record):
     faulty: bool
 
 
+class Displaced(StrEnum):
+    """What is not where it was, for all sensors alike."""
+
+    LIDAR = "lidar"
+    FRAME = "frame"
+
+
+@dataclass(frozen=True)
+class Displacement(Record):
+    """A displacement that sensors share: one explains them all as well as many do.
+
+    Attributes
+    ----------
+    of
+        What was displaced; both where readings do not show which.
+    shift, shift_sigma
+        By which the sensors, at their middle, moved along the lidar's axes; if only the frame was
+        displaced, by which poses are to be moved, at their middle, along the map's. Metres; zero
+        where there is none.
+    turn, turn_sigma
+        The same of a turn about these axes, as a rotation vector in degrees.
+    gain
+        Over changes of single sensors: twice the logarithm of the likelihood ratio, less what
+        the parameters cost (the BIC).
+    """
+
+    of: tuple[Displaced, ...]
+    shift: Row
+    shift_sigma: Row
+    turn: Row
+    turn_sigma: Row
+    gain: float
+
+
+@dataclass(frozen=True)
+class OffsetJump(Record):
+    """A jump of H at one moment of a drive.
+
+    Attributes
+    ----------
+    sensor
+        Of which.
+    stamp_ns, seconds
+        When: by its stamps, and after the first reading of the drive.
+    change, sigma
+        H after less before and its standard deviation, uT.
+    """
+
+    sensor: str
+    stamp_ns: int
+    seconds: float
+    change: Row
+    sigma: Row
+
+
 @dataclass(frozen=True)
 class DriveValidation(Record):
     """A calibration beside a drive.
@@ -216,6 +275,10 @@ class DriveValidation(Record):
         What changed at the place since it was mapped.
     explanations
         What the readings say of place and vehicle, the best first; empty where no steel is seen.
+    displacement
+        What all sensors share. Their own changes are those beside it.
+    jumps
+        Of H during the drive, in order of time. Other changes of H are those before the first.
     """
 
     sensors: tuple[ValidatedSensor, ...]
@@ -226,6 +289,8 @@ class DriveValidation(Record):
     notes: tuple[str, ...]
     sources: tuple[ChangedSource, ...] = ()
     explanations: tuple[WhatChanged, ...] = ()
+    displacement: Displacement | None = None
+    jumps: tuple[OffsetJump, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -263,6 +328,9 @@ class ComparedSensor(Record):
         Over t, rotation, gains, angles, C, H and all.
     changes
         Parts that have changed beyond both uncertainties, the plainest first.
+    detectable
+        What would have shown beside both uncertainties, each change by itself; empty in files of
+        before.
     """
 
     sensor: str
@@ -270,6 +338,7 @@ class ComparedSensor(Record):
     sigma: Row
     tests: tuple[ChangeTest, ...]
     changes: tuple[CalibrationChange, ...]
+    detectable: tuple[MinimumDetectableChange, ...] = ()
 
     def test(self, name: str) -> ChangeTest:
         """Return the test of a group by its name."""

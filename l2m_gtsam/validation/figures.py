@@ -8,7 +8,8 @@ from scipy.stats import chi2, f
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import IntArray, SourceFile, same_content
 from l2m_gtsam.maps.field_map import Summarised
-from l2m_gtsam.qa.metrics.changes import change_of
+from l2m_gtsam.qa.metrics.changes import DETECTED_SIGMAS, change_of
+from l2m_gtsam.qa.metrics.coordinates import COLUMNS, PARAMETERS, columns_of, width
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import curves, field_error, fit_figures, series
 from l2m_gtsam.records.calibration import (
@@ -25,12 +26,10 @@ from l2m_gtsam.records.validation import (
 )
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.solve.closed_form import refitted
-from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, columns_of, width
 from l2m_gtsam.validation.innovation import detectable_change, knows_its_errors
 from l2m_gtsam.validation.recheck import Recheck, SensorDrive
 
 BAND = np.array([0.025, 0.975])
-DETECTED_SIGMAS = 5.0  # a change of so many is missed once in a hundred times, or less often
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ delta are tested by how much of that they explain (chi-square of as many degrees
 part has) and named one after the other.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,11 +24,12 @@ from l2m_factors.shared_errors import whitened
 from l2m_gtsam.calibration.coverage import Coverage, NothingShared, UncertainMap, cover
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
 from l2m_gtsam.calibration.group_noise import group_noise
+from l2m_gtsam.calibration.pose_errors import pose_features
 from l2m_gtsam.calibration.view import QueryableMap, observe
 from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.qa.metrics.coordinates import COLUMNS, columns_of, width
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.solve.chi_square import chance_beyond
-from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, columns_of, width
 
 ROWS = 4000  # that are reduced at once
 UNOBSERVABLE = 1e-9  # of the best observed direction of a part: zero but for rounding
@@ -135,8 +136,17 @@ def knows_its_errors(field_map: QueryableMap) -> bool:
     return isinstance(field_map, UncertainMap)
 
 
+def held_poses(readings: Readings) -> FloatArray:
+    """Return that poses are where they are, shape (N, 6, 0)."""
+    return np.zeros((len(readings), 6, 0))
+
+
 def change_likelihood(
-    readings: Readings, field_map: QueryableMap, known: KnownCalibration, correlation_s: float
+    readings: Readings,
+    field_map: QueryableMap,
+    known: KnownCalibration,
+    correlation_s: float,
+    displaced: Callable[[Readings], FloatArray] = held_poses,
 ) -> ChangeLikelihood:
     """Return the likelihood of changes of a sensor's known parameters.
 
@@ -149,23 +159,26 @@ def change_likelihood(
         The calibration, whose own errors do not count here.
     correlation_s
         How long an error of a pose lasts, seconds.
+    displaced
+        What Q displacements of all poses together do to each of N: right perturbations per unit,
+        radians before metres, shape (N, 6, Q).
 
     Returns
     -------
     ChangeLikelihood
-        Of a change of (t, C row by row, H, time offset).
+        Of a change of (t, C row by row, H, time offset), then of such displacements.
     """
     estimate = known.estimate()
     view = observe(readings, field_map, estimate, 1)
     errors = field_map if isinstance(field_map, UncertainMap) else NothingShared()
     coverage = cover(view, errors, estimate, correlation_s)
     noise = group_noise(view, field_map, coverage, estimate)
-    J, e = _linearised(view.readings, field_map, estimate)
+    J, e = _linearised(view.readings, field_map, estimate, displaced)
     by_number = _number_errors(view.readings, known.number_sigma)
     C, at = estimate.C()[0], coverage.columns
     shared = sum(coverage.sizes.values())
     numbers = slice(shared, shared + by_number.shape[2])
-    width = numbers.stop + PARAMETERS + 1
+    width = numbers.stop + J.shape[2] + 1
     collected = _SequentialQR(width, prior_rows(coverage, width, numbers))
     for group, own, W in zip(coverage.groups, noise.errors, noise.whitenings, strict=True):
         rows = np.zeros((3 * len(group.rows), width))
@@ -219,12 +232,16 @@ def prior_rows(coverage: Coverage, width: int, numbers: slice) -> FloatArray:
 
 
 def _linearised(
-    readings: Readings, field_map: QueryableMap, estimate: Estimate
+    readings: Readings,
+    field_map: QueryableMap,
+    estimate: Estimate,
+    displaced: Callable[[Readings], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives of predicted readings, (N, 3, 16), and innovations in uT, (N, 3)."""
+    """Return derivatives of predicted readings, (N, 3, 16 + Q), and innovations in uT, (N, 3)."""
     batch = batch_readings(readings, field_map)
     found = batch.residuals(estimate.values([0]), 0)
-    return np.concatenate(batch.jacobians(found), axis=2), -found.residual
+    by_pose = pose_features(displaced(readings), found.b_lidar, found.slope, found.t_lidar_mag)
+    return np.concatenate([*batch.jacobians(found), found.C @ by_pose], axis=2), -found.residual
 
 
 def _number_errors(readings: Readings, sigma: FloatArray) -> FloatArray:
@@ -243,22 +260,22 @@ def marginalise_calibration(
     Parameters
     ----------
     likelihood
-        Of t, C row by row, H and the time offset.
+        Of t, C row by row, H and the time offset, and of what else there is.
     covariance
         Of the calibration, shape (16, 16), finite.
     basis
-        Change of these per unit of each of Q coordinates of a change, shape (16, Q).
+        Change of all these per unit of each of Q coordinates of a change, shape (P, Q).
     """
     # epsilon = root u with u ~ N(0, I): rows for u and the change, then the prior of u; what QR
     # leaves below u is the marginal likelihood of the change (Bierman 1977, ch. 5).
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    count = len(root)
-    rows = np.zeros((2 * count, count + basis.shape[1] + 1))
-    rows[:count, :count] = likelihood.root @ root
-    rows[:count, count:-1] = likelihood.root @ basis
-    rows[:count, -1] = likelihood.white
-    rows[count:, :count] = np.eye(count)
+    count, above = len(root), len(likelihood.root)
+    rows = np.zeros((above + count, count + basis.shape[1] + 1))
+    rows[:above, :count] = likelihood.root[:, :count] @ root
+    rows[:above, count:-1] = likelihood.root @ basis
+    rows[:above, -1] = likelihood.white
+    rows[above:, :count] = np.eye(count)
     left = reduced(rows)[count:, count:]
     found = ChangeLikelihood.of(left)
     return ChangeLikelihood(found.root, found.white, found.rest + likelihood.rest)

@@ -15,17 +15,23 @@ from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources
 from l2m_gtsam.calibration.changed_places import ChangesOptions, is_place_of, suspected
 from l2m_gtsam.calibration.coverage import UncertainMap
-from l2m_gtsam.calibration.drive_sources import drive_sources
+from l2m_gtsam.calibration.drive_sources import DriveSources, drive_sources
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings, joined_rows
 from l2m_gtsam.maps.sources.found_sources import FoundSources, price, refined
 from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.qa.metrics.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.validation import EXPECTED_TIMES
 from l2m_gtsam.records.places import CLEAR, ChangedSource, WhatChanged
-from l2m_gtsam.records.validation import CalibrationPart, NotValidated, ValidatedSensor
-from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
+from l2m_gtsam.records.validation import (
+    CalibrationPart,
+    NotValidated,
+    OffsetJump,
+    ValidatedSensor,
+)
+from l2m_gtsam.validation.jumps import FoundJumps, jumps_of
 
 TIE = "The readings do not show which"
 Parts = tuple[CalibrationPart, ...]
@@ -154,10 +160,54 @@ def capitalised(words: str) -> str:
     return f"{words[0].upper()}{words[1:]}"
 
 
-def shown_sources(
+@dataclass(frozen=True)
+class SuspectedDrive:
+    """A drive that differs from the map by more than that may err.
+
+    Attributes
+    ----------
+    rows, drive
+        Averaged readings, the sensors free.
+    places
+        Where it does, metres, shape (M, 3).
+    field_map, options
+        The map, and how sources are looked for.
+    """
+
+    rows: MarginalRows
+    drive: AveragedDrive
+    places: FloatArray
+    field_map: QueryableMap
+    options: ChangesOptions
+
+    def sources(self) -> DriveSources:
+        """Return the sources that it shows."""
+        return drive_sources(
+            self.rows, self.drive, self.places, self.field_map, self.options.sources
+        )
+
+    def jumps(self) -> tuple[OffsetJump, ...]:
+        """Return the jumps of H that explain all, or more than sources, or what these leave."""
+        found = jumps_of(self.rows, self.drive)
+        if found.each and self.is_suspected_beside(found):
+            shown = self.sources()
+            if shown.gain > found.gain:
+                left = self.rows.residual - shown.found.field(self.rows.points)
+                found = jumps_of(replace(shown.rows, residual=left), self.drive)
+        return found.records(self.drive.view.readings)
+
+    def is_suspected_beside(self, found: FoundJumps) -> bool:
+        """Return whether places are suspected beside jumps."""
+        averages = self.drive.averages
+        left = replace(averages, residual=averages.residual - found.field)
+        beside = replace(self.drive, averages=left)
+        return bool(len(suspected(beside, self.field_map, self.options.averaging)))
+
+
+def suspected_drive(
     readings: Readings, field_map: QueryableMap, estimate: Estimate, options: ChangesOptions
-) -> ShownSources | None:
-    """Return sources that readings show; none where no place is suspected, or none stands out.
+) -> SuspectedDrive | None:
+    """Return a drive on which steel may have come or gone; none where no place is suspected.
 
     Parameters
     ----------
@@ -177,9 +227,16 @@ def shown_sources(
     if not len(places):
         return None
     rows = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
-    shown = drive_sources(rows, drive, places, field_map, options.sources)
+    return SuspectedDrive(rows, drive, places, field_map, options)
+
+
+def shown_sources(suspect: SuspectedDrive | None) -> ShownSources | None:
+    """Return sources that a drive shows; none where none stands out."""
+    if suspect is None:
+        return None
+    shown = suspect.sources()
     found = shown.of_changes()
-    return ShownSources(shown.rows, drive, found) if len(found) else None
+    return ShownSources(shown.rows, suspect.drive, found) if len(found) else None
 
 
 def is_elsewhere(
@@ -188,13 +245,13 @@ def is_elsewhere(
 ) -> bool:
     """Return whether the map is of another place, or in another frame.
 
-    It then explains the readings of no sensor, and steel makes up for that in no sensor either:
-    what is found are patches, not steel.
+    It then explains the readings of no sensor, and what is found besides makes up for that in no
+    sensor either: these are patches.
 
     Parameters
     ----------
     found, beside
-        Sensors tested in the map, and with the steel that was found.
+        Sensors tested in the map, and beside what was found.
     """
     unlike = QaOptions().unexplained.fail
     pairs = [

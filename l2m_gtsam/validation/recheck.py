@@ -9,10 +9,7 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.trust import plausible, residuals
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, Readings, Trajectory
-from l2m_gtsam.recording.sync import with_offsets
-from l2m_gtsam.records.validation import CalibrationPart
-from l2m_gtsam.solve.robust import grown, median_noise
-from l2m_gtsam.validation.coordinates import (
+from l2m_gtsam.qa.metrics.coordinates import (
     COLUMNS,
     NO_CHANGE,
     PARAMETERS,
@@ -20,6 +17,9 @@ from l2m_gtsam.validation.coordinates import (
     changes_of,
     columns_of,
 )
+from l2m_gtsam.recording.sync import with_offsets
+from l2m_gtsam.records.validation import CalibrationPart
+from l2m_gtsam.solve.robust import grown, median_noise
 from l2m_gtsam.validation.innovation import (
     OPEN_SIGMAS,
     ChangeLikelihood,
@@ -72,6 +72,8 @@ class Recheck:
         Their coordinates, part by part.
     used
         Which readings count: inside the map, and explained beside the others, shape (N,).
+    spread
+        Covariance of the calibration, with wide variances for what it leaves open, shape (16, 16).
     """
 
     likelihood: ChangeLikelihood
@@ -80,6 +82,7 @@ class Recheck:
     change: FloatArray
     covariance: FloatArray
     used: BoolArray
+    spread: FloatArray
 
 
 def recheck(
@@ -113,14 +116,16 @@ def recheck(
         used = used & inside(drive, field_map, known)
         if used.sum() < options.min_readings:
             used = usable(drive, field_map, known, options)
-        likelihood = _about(drive, field_map, known, used, options)
+        likelihood = about(drive, field_map, known, used, options)
         likelihood = marginalise_calibration(likelihood, spread, basis)
     # What is open takes a degree of freedom, unless readings do not depend on it, as on a clock
     # where motion is not known. (All depend on C, where coordinates are not the parameters.)
     matters = np.linalg.norm(likelihood.root, axis=0) > 0
     open_ = int(np.sum(~np.isfinite(np.diag(covariance)) & matters))
     freedom = 3 * int(used.sum()) - open_, int(matters.sum()) - open_
-    return Recheck(likelihood, freedom, followed.parts, followed.change, followed.covariance, used)
+    return Recheck(
+        likelihood, freedom, followed.parts, followed.change, followed.covariance, used, spread
+    )
 
 
 @dataclass(frozen=True)
@@ -149,7 +154,7 @@ def _followed(
     # Gauss-Newton: linearise about the changed calibration, test and estimate the change anew.
     for _ in range(ROUNDS):
         basis = changes_of(C, change)
-        likelihood = _about(drive, field_map, here, used, options).recentred(basis @ change)
+        likelihood = about(drive, field_map, here, used, options).recentred(basis @ change)
         likelihood = marginalise_calibration(likelihood, spread, basis)
         before, parts = parts, parts_changed(likelihood, 3 * int(used.sum()), chance)
         columns = columns_of(parts)
@@ -171,7 +176,7 @@ def _settled(step: FloatArray, covariance: FloatArray) -> bool:
     return bool((np.abs(step) <= SETTLED_SIGMAS * sigma).all())
 
 
-def _about(
+def about(
     drive: SensorDrive,
     field_map: QueryableMap,
     here: KnownCalibration,
@@ -181,6 +186,23 @@ def _about(
     """Return the likelihood of a change of a calibration, linearised there."""
     readings = drive.at(float(here.vector[15])).select(used)
     return change_likelihood(readings, field_map, here, options.pose_noise.lasting_s)
+
+
+def left_by(
+    found: Recheck,
+    drive: SensorDrive,
+    field_map: QueryableMap,
+    known: KnownCalibration,
+    options: OneKeyOptions,
+) -> float:
+    """Return the squared innovation that the changes of a test do not explain."""
+    columns = columns_of(found.parts)
+    change = limited(columns, found.change)
+    here = replace(known, vector=changed_vector(known.vector, change))
+    basis = changes_of(known.vector[3:12].reshape(3, 3), change)
+    likelihood = about(drive, field_map, here, found.used, options).recentred(basis @ change)
+    likelihood = marginalise_calibration(likelihood, found.spread, basis)
+    return likelihood.squared - likelihood.explained(columns)
 
 
 def inside(drive: SensorDrive, field_map: QueryableMap, known: KnownCalibration) -> BoolArray:

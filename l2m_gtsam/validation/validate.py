@@ -1,7 +1,7 @@
 """Recording + map + calibration -> how far the calibration is still valid. Pure: no files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -30,18 +30,25 @@ from l2m_gtsam.recording.sync import stuck_sensors
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.validation import (
     CalibrationPart,
+    Displacement,
     DriveValidation,
     NotValidated,
+    OffsetJump,
     ValidatedSensor,
 )
 from l2m_gtsam.solve.correction import without_moving
+from l2m_gtsam.validation.displacement import OF_PLACE, SensorsOnDrive, common_displacement
+from l2m_gtsam.validation.exchange import TestedSensor, exchanged
 from l2m_gtsam.validation.figures import Thinning, doubts_and_notes, offset_s, sensor_figures
 from l2m_gtsam.validation.innovation import KnownCalibration, estimate_of
+from l2m_gtsam.validation.jumps import ANYTHING_UT, without_jump
 from l2m_gtsam.validation.places import (
     PlaceOrVehicle,
+    SuspectedDrive,
     is_elsewhere,
     is_searched,
     shown_sources,
+    suspected_drive,
     together,
     who_changed,
 )
@@ -106,7 +113,10 @@ def validate(
     for index, sensor in enumerate(known):
         progress("validating", index / len(known))
         found.append(_tested(test, sensor))
-    judged, beside = _judged(test, known, found)
+    test, known, found = _as_exchanged(test, known, found)
+    test, found, displacement = _beside_displacement(test, known, found)
+    test, found, suspect = _beside_jumps(test, known, found)
+    judged, beside = _judged(test, known, found, suspect)
     if judged is not None and judged.best.of_place:
         field_map, found = ChangedMap(field_map, judged.found), beside
     progress("validating", 1.0)
@@ -126,6 +136,8 @@ def validate(
         notes=notes,
         sources=() if judged is None else judged.sources,
         explanations=() if judged is None else judged.explanations,
+        displacement=displacement,
+        jumps=test.jumps,
     )
 
 
@@ -147,6 +159,10 @@ class _Test:
         As of `validate`.
     thinning
         How much of the drive is kept.
+    jumps
+        Of H that are taken off the readings.
+    reads_as
+        By the name of a sensor that of another, whose calibration its readings fit.
     """
 
     recording: Recording
@@ -157,6 +173,26 @@ class _Test:
     options: CalibrationOptions
     chance: float
     thinning: Thinning
+    jumps: tuple[OffsetJump, ...] = ()
+    reads_as: Mapping[str, str] = field(default_factory=dict)
+
+    def drive_of(self, sensor: SensorCalibration) -> SensorDrive:
+        """Return what a sensor read, without what follows recorded numbers and without jumps."""
+        found = drive_of(self.readings, self.recording, sensor)
+        own = found.readings
+        for jump in self.jumps_of(sensor):
+            own = without_jump(own, jump)
+        return replace(found, readings=own)
+
+    def known(self, sensor: SensorCalibration) -> KnownCalibration:
+        """Return its calibration; a jump is a number whose field may be anything."""
+        found, jumps = _known(self.recording, sensor), len(self.jumps_of(sensor))
+        anything = np.full((jumps, 3), ANYTHING_UT)
+        return replace(found, number_sigma=np.concatenate([found.number_sigma, anything]))
+
+    def jumps_of(self, sensor: SensorCalibration) -> tuple[OffsetJump, ...]:
+        """Return the jumps of a sensor."""
+        return tuple(each for each in self.jumps if each.sensor == sensor.sensor)
 
 
 def _test_of(
@@ -186,18 +222,94 @@ def _test_of(
     )
 
 
+def _as_exchanged(
+    test: _Test,
+    known: list[SensorCalibration],
+    found: list[ValidatedSensor | NotValidated],
+) -> tuple[_Test, list[SensorCalibration], list[ValidatedSensor | NotValidated]]:
+    """Return the calibrations that readings are of, and what is found with them."""
+    tested = [
+        TestedSensor(test.drive_of(one), test.known(one), each)
+        for one, each in zip(known, found, strict=True)
+        if isinstance(each, ValidatedSensor)
+    ]
+    theirs = exchanged(tested, test.field_map)
+    if not theirs:
+        return test, known, found
+    of = {each.sensor: each for each in known}
+    test = replace(test, reads_as=theirs)
+    known = [replace(of[theirs.get(name, name)], sensor=name) for name in of]
+    return test, known, [_tested(test, each) for each in known]
+
+
+def _beside_displacement(
+    test: _Test,
+    known: Sequence[SensorCalibration],
+    found: list[ValidatedSensor | NotValidated],
+) -> tuple[_Test, list[ValidatedSensor | NotValidated], Displacement | None]:
+    """Return the displacement that sensors share, if they do, and what is found beside it."""
+    kept = _kept(known, found)
+    if sum(not OF_PLACE.isdisjoint(parts_of(each)) for each in found) < 2:
+        return test, found, None
+    sensors = SensorsOnDrive(
+        tuple(map(test.drive_of, kept)),
+        tuple(map(test.known, kept)),
+        tuple(finite(joint_covariance(each), test.options.solve) for each in kept),
+        test.field_map,
+        test.options.solve,
+    )
+    shared = common_displacement(sensors, test.chance)
+    if shared is None:
+        return test, found, None
+    by, record = shared
+    poses = by.applied(test.recording.trajectory)
+    displaced = replace(test, recording=replace(test.recording, trajectory=poses))
+    beside = [_tested(displaced, each) for each in known]
+    return (test, found, None) if is_elsewhere(found, beside) else (displaced, beside, record)
+
+
+def _kept(
+    known: Sequence[SensorCalibration], found: Sequence[ValidatedSensor | NotValidated]
+) -> list[SensorCalibration]:
+    """Return the sensors that could be tested."""
+    pairs = zip(known, found, strict=True)
+    return [one for one, each in pairs if isinstance(each, ValidatedSensor)]
+
+
+def _suspected(test: _Test, kept: Sequence[SensorCalibration]) -> SuspectedDrive | None:
+    """Return the drive if places are suspected on it."""
+    if not kept:
+        return None
+    readings, estimate = _of_all(test, kept)
+    return suspected_drive(readings, test.field_map, estimate, test.options.changes)
+
+
+def _beside_jumps(
+    test: _Test,
+    known: Sequence[SensorCalibration],
+    found: list[ValidatedSensor | NotValidated],
+) -> tuple[_Test, list[ValidatedSensor | NotValidated], SuspectedDrive | None]:
+    """Return the test without jumps of H, what is found then, and the drive if it is suspected."""
+    suspect = _suspected(test, _kept(known, found))
+    jumps = () if suspect is None else suspect.jumps()
+    if not jumps:
+        return test, found, suspect
+    without = replace(test, jumps=jumps)
+    beside = [_tested(without, each) for each in known]
+    if is_elsewhere(found, beside):
+        return test, found, suspect
+    return without, beside, _suspected(without, _kept(known, beside))
+
+
 def _judged(
     test: _Test,
     known: Sequence[SensorCalibration],
     found: Sequence[ValidatedSensor | NotValidated],
+    suspect: SuspectedDrive | None,
 ) -> tuple[PlaceOrVehicle | None, list[ValidatedSensor | NotValidated]]:
     """Return whether the place changed or the vehicle, and what is found if the place did."""
-    pairs = zip(known, found, strict=True)
-    kept = [one for one, each in pairs if isinstance(each, ValidatedSensor)]
-    if not kept:
-        return None, []
-    readings, estimate = _of_all(test, kept)
-    shown = shown_sources(readings, test.field_map, estimate, test.options.changes)
+    kept = _kept(known, found)
+    shown = shown_sources(suspect)
     if shown is None:
         return None, []
     changed = replace(test, field_map=ChangedMap(test.field_map, shown.found))
@@ -220,8 +332,8 @@ def parts_of(found: ValidatedSensor | NotValidated) -> tuple[CalibrationPart, ..
 def _of_all(test: _Test, known: Sequence[SensorCalibration]) -> tuple[Readings, Estimate]:
     """Return the readings of sensors inside the map, and their calibrations."""
     names = tuple(each.sensor for each in known)
-    parts = [drive_of(test.readings, test.recording, each).at(offset_s(each)) for each in known]
-    calibrations = [_known(test.recording, each) for each in known]
+    parts = [test.drive_of(each).at(offset_s(each)) for each in known]
+    calibrations = [test.known(each) for each in known]
     vectors = np.array([each.vector for each in calibrations])
     estimate = estimate_of(vectors, np.array([each.noise for each in calibrations]))
     readings = together(parts, names)
@@ -231,15 +343,15 @@ def _of_all(test: _Test, known: Sequence[SensorCalibration]) -> tuple[Readings, 
 
 def _tested(test: _Test, sensor: SensorCalibration) -> ValidatedSensor | NotValidated:
     """Return one sensor tested on the drive, or why it cannot be."""
-    drive, options = drive_of(test.readings, test.recording, sensor), test.options
+    drive, options = test.drive_of(sensor), test.options
     limits = test.limits[sensor.sensor]
     if reason := _why_untested(drive, test.field_map, sensor, options, sensor.sensor in test.stuck):
         beyond = f"{saturation_sentence(limits)}. " if limits else ""
         return NotValidated(sensor.sensor, f"{beyond}{reason}", faulty=True)
-    known, covariance = _known(test.recording, sensor), joint_covariance(sensor)
+    known, covariance = test.known(sensor), joint_covariance(sensor)
     found = recheck(drive, test.field_map, known, covariance, options.solve, test.chance)
     figures = sensor_figures(drive, test.field_map, sensor, found, test.thinning)
-    return replace(figures, limits=limits)
+    return replace(figures, limits=limits, reads_as=test.reads_as.get(sensor.sensor, ""))
 
 
 def drive_of(readings: Readings, recording: Recording, sensor: SensorCalibration) -> SensorDrive:

@@ -101,6 +101,22 @@ class MarginalRows:
             prior=block_diag(self.prior, ANYTHING_UT**-2 * np.eye(len(columns))),
         )
 
+    def beside(self, features: FloatArray, sigma: float) -> "MarginalRows":
+        """Return the same beside fields of any strength.
+
+        Parameters
+        ----------
+        features
+            M of them, per unit, shape (N, 3, M).
+        sigma
+            Standard deviation of each one's strength before readings.
+        """
+        return replace(
+            self,
+            nuisance=hstack([self.nuisance, csr_array(self.whitened(features))], format="csr"),
+            prior=block_diag(self.prior, sigma**-2 * np.eye(features.shape[2])),
+        )
+
     def near(self, keep: BoolArray) -> "MarginalRows":
         """Return the readings of all slots of which some are to be kept, (N,), as views.
 

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, FloatArray, same_content
 from l2m_gtsam.geometry import propagated
+from l2m_gtsam.qa.metrics.coordinates import COLUMNS, changes_of
 from l2m_gtsam.qa.metrics.mounting import PAIRS, gains, sensor_axes, skews_deg
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.recording.drive_trace import same_drive
@@ -19,11 +20,14 @@ from l2m_gtsam.records.validation import (
     CalibrationPart,
     ChangeTest,
     ComparedSensor,
+    MinimumDetectableChange,
     NotValidated,
 )
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.solve.chi_square import chance_beyond
 
+DETECTED_SIGMAS = 5.0  # a change of so many is missed once in a hundred times, or less often
+DETECTED_BY_WHOLE = 6.2  # the same among fifteen parameters instead of three
 TINY = 1e-12  # of the largest variance, in units of sigmas: a direction that both share exactly
 INDEPENDENT = (
     "The errors of both calibrations count as independent: the covariance of their difference is "
@@ -57,6 +61,33 @@ class CalibrationDifference:
         """Standard deviations; infinite for what is open."""
         sigma = np.sqrt(np.diag(self.covariance))
         return np.asarray(np.where(self.known, sigma, np.inf))
+
+    @property
+    def detectable(self) -> float:
+        """The smallest difference that surely shows, whatever its direction; infinite if none."""
+        if not self.known.all():
+            return float("inf")
+        return float(DETECTED_SIGMAS * np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+
+    def detectable_by_whole(self, basis: FloatArray) -> float:
+        """Return the smallest change of a part that the test of all entries shows.
+
+        Parameters
+        ----------
+        basis
+            What a unit of each of its coordinates does to the entries, shape (P, Q), with all that
+            is known or open as it is.
+        """
+        known = self.known
+        touched = np.abs(basis).max(axis=1) > 0
+        if not known[touched].all():
+            return float("inf")
+        sigma = self.sigma[known]
+        S = self.covariance[np.ix_(known, known)] / np.outer(sigma, sigma)
+        columns = basis[known] / sigma[:, None]
+        information = columns.T @ np.linalg.pinv(S, rcond=TINY, hermitian=True) @ columns
+        least = float(np.linalg.eigvalsh(information)[0])
+        return DETECTED_BY_WHOLE / least**0.5 if least > 0 else float("inf")
 
     def part(self, at: slice) -> "CalibrationDifference":
         """Return some of its entries."""
@@ -145,7 +176,22 @@ def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float
         sigma=row(whole.sigma, 9),
         tests=tuple(tests.values()),
         changes=_changes(parts, tests, chance),
+        detectable=tuple(
+            MinimumDetectableChange(part, _detectable(part, each, whole, old))
+            for part, each in parts.items()
+        ),
     )
+
+
+def _detectable(
+    part: CalibrationPart,
+    own: CalibrationDifference,
+    whole: CalibrationDifference,
+    old: SensorCalibration,
+) -> float:
+    """Return the smallest change of a part by itself that its test or that of all shows."""
+    basis = changes_of(old.distortion.C)[: len(whole.value), COLUMNS[part]]
+    return min(own.detectable, whole.detectable_by_whole(basis))
 
 
 def differences(

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from l2m_gtsam.qa.metrics.changes import change_of
 from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions, thresholds
 from l2m_gtsam.qa.verdict.places import source_reasons
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, beyond_range, outside_map
@@ -12,11 +13,13 @@ from l2m_gtsam.records.validation import (
     CalibrationComparison,
     CalibrationPart,
     ComparedSensor,
+    Displaced,
+    Displacement,
     DriveValidation,
     NotValidated,
     ValidatedSensor,
 )
-from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict
+from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict, worst
 from l2m_gtsam.text import in_unit, significant, with_sigma
 
 SHARED_LIMITS = ("unexplained", "rejected", "outside_map", "saturated")
@@ -66,8 +69,16 @@ def judge_validation(
     found: dict[str, list[Reason]] = {}
     if drive is not None:
         shared += _on_drive(drive, options)
+        shared += _displaced(drive, options)
         for sensor in drive.sensors:
-            found.setdefault(sensor.sensor, []).extend(_on_sensor(sensor, options))
+            found.setdefault(sensor.sensor, []).extend(
+                [
+                    *_exchanged(sensor),
+                    *_moved_with_all(drive, options),
+                    *_jumped(drive, sensor, options),
+                    *_on_sensor(sensor, options),
+                ]
+            )
         _add_missing(found, drive.missing)
     if comparison is not None:
         shared.append(Reason(Level.PASS, comparison.assumption))
@@ -104,6 +115,89 @@ def _on_drive(drive: DriveValidation, options: QaOptions) -> list[Reason]:
         *source_reasons(drive.sources),
         *(Reason(Level.PASS, each) for each in drive.notes),
     ]
+
+
+def _displaced(drive: DriveValidation, options: QaOptions) -> list[Reason]:
+    """Return the displacement that all sensors share, and what it is likely of."""
+    found = drive.displacement
+    if found is None:
+        return []
+    level, count = _displaced_level(found, options), len(drive.sensors)
+    if Displaced.LIDAR not in found.of:
+        text = (
+            f"What all {count} sensors read fits if the poses are {_moved_by(found, 'map')}: their "
+            "frame is not that of the map. Take poses on the map's point cloud. The sensors were "
+            "tested with poses that were moved so."
+        )
+        return [Reason(min(level, Level.WARN, key=lambda each: each.rank), text)]
+    tied = ", or the poses are in another frame than the map's" if len(found.of) > 1 else ""
+    text = (
+        f"All {count} sensors together {_moved_by(found, 'lidar')}: the mount of the lidar, or of "
+        f"what carries them all, gave way or was changed{tied}. What is said of single sensors is "
+        "beside it."
+    )
+    return [Reason(level, text)]
+
+
+def _moved_with_all(drive: DriveValidation, options: QaOptions) -> list[Reason]:
+    """Return of one sensor that it moved as all did."""
+    found = drive.displacement
+    if found is None or Displaced.LIDAR not in found.of:
+        return []
+    text = "It moved with all others (see above): its t and its rotation are not what they were."
+    return [Reason(_displaced_level(found, options), text)]
+
+
+def _displaced_level(found: Displacement, options: QaOptions) -> Level:
+    limits = limits_of(options.validation)
+    return worst(limits[each.part].level(each.size) for each in _displacements(found))
+
+
+def _displacements(found: Displacement) -> list[CalibrationChange]:
+    """Return the parts of a displacement that there are."""
+    each = (
+        (CalibrationPart.PLACE, found.shift, found.shift_sigma),
+        (CalibrationPart.ROTATION, found.turn, found.turn_sigma),
+    )
+    return [change_of(part, np.array(v), np.array(s), 0.0) for part, v, s in each if any(s)]
+
+
+def _moved_by(found: Displacement, axes: str) -> str:
+    """Return a displacement along the axes of a frame as a phrase."""
+    verbs = {CalibrationPart.PLACE: "moved", CalibrationPart.ROTATION: "turned"}
+    ways = {CalibrationPart.PLACE: "along", CalibrationPart.ROTATION: "about"}
+    return " and ".join(
+        f"{verbs[each.part]} by {_size_and_parts(each)} {ways[each.part]} the {axes}'s x, y, z"
+        for each in _displacements(found)
+    )
+
+
+def _exchanged(sensor: ValidatedSensor) -> list[Reason]:
+    """Return that a sensor reads what another should."""
+    if not sensor.reads_as:
+        return []
+    text = (
+        f"Its readings fit the calibration of {sensor.reads_as}, not its own: sensors are "
+        "exchanged. Exchange their topics, their cables or their names in `bag.fields`. It was "
+        f"tested as {sensor.reads_as}."
+    )
+    return [Reason(Level.FAIL, text)]
+
+
+def _jumped(drive: DriveValidation, sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
+    """Return the jumps of its H during the drive."""
+    reasons = []
+    for each in drive.jumps:
+        if each.sensor != sensor.sensor:
+            continue
+        part, change, sigma = CalibrationPart.OFFSET, np.array(each.change), np.array(each.sigma)
+        jump = change_of(part, change, sigma, 0.0)
+        text = (
+            f"{each.seconds:.0f} s after the start its offset H jumped by {by_how_much(jump)}: "
+            "something magnetic was laid near it, taken away or switched."
+        )
+        reasons.append(Reason(options.validation.offset_ut.level(jump.size), text))
+    return reasons
 
 
 def _misfit(sensor: ValidatedSensor, options: QaOptions) -> bool:
@@ -184,18 +278,22 @@ def _counted(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
 
 def _blind(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     """Return which changes that would fail the drive need not have shown."""
+    hidden = _hidden(sensor, options, "it shows")
+    if not hidden:
+        return []
+    return [Reason(Level.WARN, f"This drive cannot rule out a change that would FAIL: {hidden}.")]
+
+
+def _hidden(sensor: ValidatedSensor | ComparedSensor, options: QaOptions, shows: str) -> str:
+    """Return parts of a sensor whose changes would fail and need not show, as a phrase."""
     limits, named = limits_of(options.validation), {each.part for each in sensor.changes}
-    hidden = [
-        f"{NAMES[each.part]} (it shows changes from {amount(each.part, each.size)} on)"
+    return ", ".join(
+        f"{NAMES[each.part]} ({shows} changes from {amount(each.part, each.size)} on)"
         if np.isfinite(each.size)
         else f"{NAMES[each.part]} (no change of it shows)"
         for each in sensor.detectable
         if each.part not in (*named, CalibrationPart.CLOCK) and each.size > limits[each.part].fail
-    ]
-    if not hidden:
-        return []
-    text = f"This drive cannot rule out a change that would FAIL: {', '.join(hidden)}."
-    return [Reason(Level.WARN, text)]
+    )
 
 
 def _ending(sensor: ValidatedSensor, _: QaOptions) -> list[Reason]:
@@ -205,10 +303,20 @@ def _ending(sensor: ValidatedSensor, _: QaOptions) -> list[Reason]:
 
 
 def _on_comparison(sensor: ComparedSensor, options: QaOptions) -> list[Reason]:
-    """Return what has changed since the older calibration."""
+    """Return what has changed since the older calibration, and what might have unseen."""
     whole = sensor.test("all")
     if not whole.freedom:
         return [Reason(Level.WARN, "The two calibrations determine nothing of it in common.")]
+    reasons = _since(sensor, options)
+    if hidden := _hidden(sensor, options, "they show"):
+        text = f"The two calibrations cannot rule out a change that would FAIL: {hidden}."
+        reasons.append(Reason(Level.WARN, text))
+    return reasons
+
+
+def _since(sensor: ComparedSensor, options: QaOptions) -> list[Reason]:
+    """Return what has changed since the older calibration."""
+    whole = sensor.test("all")
     if sensor.changes:
         return [
             _change(each, options, "since the old calibration {name} {has} changed by {amount}")
@@ -244,11 +352,15 @@ def amount(part: CalibrationPart, size: float) -> str:
 
 def by_how_much(change: CalibrationChange) -> str:
     """Return size, parts and sigmas of a change."""
-    factor, unit, along = SHOWN[change.part]
+    return f"{_size_and_parts(change)}{SHOWN[change.part][2]}"
+
+
+def _size_and_parts(change: CalibrationChange) -> str:
+    factor, unit, _ = SHOWN[change.part]
     parts = ", ".join(
         with_sigma(factor * value, factor * sigma)
         for value, sigma in zip(change.change, change.sigma, strict=True)
     )
     if len(change.change) == 1:
         return in_unit(parts, unit)
-    return f"{amount(change.part, change.size)}: {in_unit(f'({parts})', unit)}{along}"
+    return f"{amount(change.part, change.size)}: {in_unit(f'({parts})', unit)}"

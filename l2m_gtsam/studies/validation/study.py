@@ -11,7 +11,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP
 from l2m_gtsam.qa.verdict.validation import judge_validation
-from l2m_gtsam.records.validation import CalibrationPart, DriveValidation
+from l2m_gtsam.records.validation import CalibrationPart, Displaced, DriveValidation
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.studies.study import Study
 from l2m_gtsam.studies.validation.drives import (
@@ -102,7 +102,8 @@ def is_right(
 ) -> bool:
     """Return whether what changed is named, where it is, and nothing else.
 
-    A mount that is turned moves its sensors, too, which may be named or too little to be. Of a map
+    A mount that is turned is one displacement of all sensors; or each of them is named, which it
+    moves, too, by as much as may be named or too little to be. Of a map
     of another place it is said that it does not fit, and nothing of steel.
     """
     if change is TrueCause.ELSEWHERE:
@@ -113,6 +114,11 @@ def is_right(
     if drive.steel is None and found.sources:
         return False
     parts = [{each.part for each in sensor.changes} for sensor in found.sensors]
+    if found.jumps:
+        return False
+    if found.displacement is not None:
+        of_mount = change is TrueCause.TURNED and Displaced.LIDAR in found.displacement.of
+        return of_mount and not any(parts)
     if change in (TrueCause.NOTHING, TrueCause.PLACE):
         return not any(parts)
     wanted = {PARTS[change]}

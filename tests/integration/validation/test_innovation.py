@@ -10,7 +10,7 @@ from l2m_factors import skew
 from l2m_gtsam.calibration.pose_errors import pose_seconds
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.validation.coordinates import changes_of
+from l2m_gtsam.qa.metrics.coordinates import changes_of
 from l2m_gtsam.validation.innovation import (
     KnownCalibration,
     change_likelihood,

@@ -233,6 +233,8 @@ def test_no_steel_is_made_up_where_the_map_is_of_elsewhere() -> None:
     drive = changed_drive(options, place, TrueCause.ELSEWHERE, 1).recording
     found = validate(drive, place.field_map, place.calibration, CalibrationOptions(), 1e-3)
     assert found.sources == ()
+    assert found.jumps == ()
+    assert found.displacement is None
     assert "map does not fit this drive" in judged(found).reasons[0].text
 
 

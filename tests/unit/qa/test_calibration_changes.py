@@ -228,3 +228,35 @@ def test_joint_calibrations_that_share_a_drive_say_so() -> None:
     assert not compare_calibrations(first, other, CHANCE).same_bag
     unknown = calibration(sensor(), bag=None)
     assert not compare_calibrations(unknown, unknown, CHANCE).same_bag
+
+
+def test_what_both_calibrations_could_not_have_shown_is_a_warning() -> None:
+    """Two of them with sigmas of 10 mm each: a place that is off by 60 mm would be no news."""
+    sigma = SIGMA.copy()
+    sigma[:3] = 0.01
+    vague = plain(covariance=np.diag(sigma**2))
+    found = compare_calibrations(calibration(vague), calibration(vague), CHANCE)
+    (place,) = [e for e in found.sensors[0].detectable if e.part is CalibrationPart.PLACE]
+    assert place.size == pytest.approx(5 * np.sqrt(2) * 0.01)
+    (verdict,) = judge_validation(None, found, QaOptions()).sensors
+    assert verdict.level == "warn"
+    assert "its place t (they show changes from 71 mm on)" in verdict.reasons[0].text
+
+
+def test_a_change_by_itself_shows_where_its_part_is_known_with_others() -> None:
+    """H to 3 uT and C to 0.1, but both together well: a change of one of them shows."""
+    root = np.diag(SIGMA)
+    root[3, 12], root[12, 12] = 0.1, 3.0
+    known = plain(covariance=root @ root.T)
+    found = compare_sensor(known, known, CHANCE)
+    S = 2 * known.covariance
+    (offset,) = [each for each in found.detectable if each.part is CalibrationPart.OFFSET]
+    least = np.linalg.eigvalsh(np.linalg.inv(S)[12:, 12:])[0]
+    assert offset.size == pytest.approx(6.2 / np.sqrt(least), rel=1e-6)
+    assert offset.size < 5 * found.sigma[12]
+
+
+def test_what_one_calibration_leaves_open_could_not_have_shown() -> None:
+    found = compare_sensor(open_in("mag", slice(0, 1), "no height"), plain(), CHANCE)
+    (place,) = [each for each in found.detectable if each.part is CalibrationPart.PLACE]
+    assert np.isinf(place.size)

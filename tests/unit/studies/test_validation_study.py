@@ -9,7 +9,7 @@ import pytest
 
 from l2m_gtsam.data import Trajectory
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP
-from l2m_gtsam.records.validation import CalibrationPart
+from l2m_gtsam.records.validation import CalibrationPart, Displaced
 from l2m_gtsam.records.verdict import Level, Reason, Verdict
 from l2m_gtsam.simulate.hall_drives import calibration_drive
 from l2m_gtsam.simulate.steel_hall import steel_hall
@@ -26,9 +26,19 @@ STEEL = np.array([1.0, 2.0, 0.5])
 TURN, MOVE, IRON = CalibrationPart.ROTATION, CalibrationPart.PLACE, CalibrationPart.OFFSET
 
 
-def said(*parts: set[CalibrationPart], sources: tuple[float, ...] = ()) -> Any:
-    """What a validation found: parts of each sensor, and sources so far from the steel."""
+def said(
+    *parts: set[CalibrationPart],
+    sources: tuple[float, ...] = (),
+    displaced: tuple[Displaced, ...] = (),
+    jumps: int = 0,
+) -> Any:
+    """What a validation found: parts of each sensor, and sources so far from the steel.
+
+    And what all sensors share.
+    """
     return SimpleNamespace(
+        displacement=SimpleNamespace(of=displaced) if displaced else None,
+        jumps=(None,) * jumps,
         sensors=[
             SimpleNamespace(changes=[SimpleNamespace(part=p) for p in each]) for each in parts
         ],
@@ -51,6 +61,12 @@ NONE: tuple[set[CalibrationPart], ...] = (set(), set())
         (TrueCause.PLACE, said({IRON}, set(), sources=(0.1,)), False),
         (TrueCause.TURNED, said({TURN}, {TURN, MOVE}), True),
         (TrueCause.TURNED, said({TURN}, set()), False),
+        (TrueCause.TURNED, said(*NONE, displaced=(Displaced.LIDAR,)), True),
+        (TrueCause.TURNED, said(*NONE, displaced=(Displaced.LIDAR, Displaced.FRAME)), True),
+        (TrueCause.TURNED, said(*NONE, displaced=(Displaced.FRAME,)), False),
+        (TrueCause.TURNED, said({TURN}, set(), displaced=(Displaced.LIDAR,)), False),
+        (TrueCause.NOTHING, said(*NONE, displaced=(Displaced.LIDAR,)), False),
+        (TrueCause.NOTHING, said(*NONE, jumps=1), False),
         (TrueCause.TURNED, said({TURN, IRON}, {TURN}), False),
         (TrueCause.IRON, said({IRON}, {IRON}), True),
         (TrueCause.IRON, said({IRON}, {IRON, MOVE}), False),

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.qa.metrics.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of
 from l2m_gtsam.qa.metrics.mounting import gains, skews_deg
 from l2m_gtsam.records.validation import CalibrationPart
-from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of
 from l2m_gtsam.validation.innovation import (
     ChangeLikelihood,
     detectable_change,

@@ -10,9 +10,9 @@ from l2m_gtsam.calibration.averaged_rows import with_calibration
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.sources.found_sources import nothing_found
 from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.qa.metrics.coordinates import PARAMETERS
 from l2m_gtsam.records.places import CLEAR, WhatChanged
 from l2m_gtsam.records.validation import CalibrationPart
-from l2m_gtsam.validation.coordinates import PARAMETERS
 from l2m_gtsam.validation.places import (
     ANYTHING,
     PlaceOrVehicle,

@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.qa.metrics.mounting import gains, skews_deg
-from l2m_gtsam.records.validation import CalibrationPart
-from l2m_gtsam.validation.coordinates import (
+from l2m_gtsam.qa.metrics.coordinates import (
     COLUMNS,
     PARAMETERS,
     changed_vector,
     changes_of,
 )
+from l2m_gtsam.qa.metrics.mounting import gains, skews_deg
+from l2m_gtsam.records.validation import CalibrationPart
 
 SEEDS = st.integers(0, 10_000)
 
