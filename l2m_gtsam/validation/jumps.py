@@ -16,12 +16,13 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.maps.sources.found_sources import price
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.qa.metrics.plain import row
+from l2m_gtsam.qa.verdict.validation import WANDERS
 from l2m_gtsam.records.validation import OffsetJump
 
 AXES = 3
 MOMENTS = 40  # at which one is tried at once
 FEWEST = 5  # averages of the sensor before it, and after
-MOST = 3  # of a sensor: what jumps more often wanders
+MOST = WANDERS  # of a sensor: one that jumps so often does not jump
 ANYTHING_UT = 100.0  # standard deviation of a jump before readings
 
 

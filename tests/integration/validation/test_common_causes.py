@@ -132,14 +132,17 @@ def hall() -> tuple[ValidationStudyOptions, CalibratedHall]:
     return options, calibrated_hall(options, 0)
 
 
-def after_jumps(jumps: dict[int, tuple[int, FloatArray]], cause: TrueCause) -> DriveValidation:
-    """Return a test on a drive; by the number of a sensor the reading from which H is other."""
+def after_jumps(
+    jumps: dict[int, list[tuple[int, FloatArray]]], cause: TrueCause
+) -> DriveValidation:
+    """Return a test on a drive; by the number of a sensor the readings from which H is other."""
     options, place = hall()
     recording = changed_drive(options, place, cause, 1).recording
     series = list(recording.series)
-    for sensor, (first, change) in jumps.items():
+    for sensor, each in jumps.items():
         field = series[sensor].field.copy()
-        field[first:] += change
+        for first, change in each:
+            field[first:] += change
         series[sensor] = replace(series[sensor], field=field)
     recording = replace(recording, series=tuple(series))
     return validate(recording, place.field_map, place.calibration, CalibrationOptions(), 1e-3)
@@ -147,7 +150,7 @@ def after_jumps(jumps: dict[int, tuple[int, FloatArray]], cause: TrueCause) -> D
 
 def test_a_jump_of_h_is_no_steel() -> None:
     change = np.array([2.0, -1.0, 0.5])
-    found = after_jumps({1: (100, change)}, TrueCause.NOTHING)
+    found = after_jumps({1: [(100, change)]}, TrueCause.NOTHING)
     (jump,) = found.jumps
     assert jump.sensor == found.sensors[1].sensor
     assert_near(jump.change, jump.sigma, change)
@@ -162,9 +165,18 @@ def test_a_jump_of_h_is_no_steel() -> None:
 
 def test_jumps_of_several_sensors_are_told_one_by_one() -> None:
     change = np.array([0.0, 3.0, 0.0])
-    found = after_jumps({0: (60, change), 1: (140, -change)}, TrueCause.NOTHING)
+    found = after_jumps({0: [(60, change)], 1: [(140, -change)]}, TrueCause.NOTHING)
     assert [each.sensor for each in found.jumps] == [each.sensor for each in found.sensors]
     assert found.sources == ()
+
+
+def test_h_that_jumps_again_and_again_wanders() -> None:
+    step = np.array([0.0, 3.0, 0.0])
+    found = after_jumps({0: [(50, step), (100, step), (150, step)]}, TrueCause.NOTHING)
+    assert len(found.jumps) == 3
+    (first, _) = judge_validation(found, None, QaOptions()).sensors
+    (told,) = [each.text for each in first.reasons if "offset H" in each.text]
+    assert "its offset H wanders, by 9." in told or "its offset H wanders, by 8." in told
 
 
 def test_steel_is_no_jump() -> None:
