@@ -19,8 +19,8 @@ from l2m_gtsam.records.localisation import (
     SensorUse,
 )
 from l2m_gtsam.slam.disturbances import slip_notes
-from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
-from l2m_gtsam.slam.misfit import fits_decoy_as_well
+from l2m_gtsam.slam.drive import Drive, KnownSensors, as_pose, stacked
+from l2m_gtsam.slam.misfit import begins_elsewhere, fits_decoy_as_well
 from l2m_gtsam.slam.pose_graph import PoseGraph
 from l2m_gtsam.slam.solution import DriveSolution
 
@@ -164,6 +164,15 @@ def _verdict(
         message = (
             f"{explains}{left}{bent if times > LARGEST_CHI2 else ''}: another place, a wrong "
             "start, or a wrong calibration"
+        )
+        return LocalisationStatus.NOT_HERE, message
+    if begins_elsewhere(solution):
+        off = as_pose(solution.drive.start.T_map_lidar).between(solution.poses[0])
+        turned = np.rad2deg(np.linalg.norm(gtsam.Rot3.Logmap(off.rotation())))
+        message = (
+            f"{explains}, and the drive would begin {np.linalg.norm(off.translation()):.2f} m and "
+            f"{turned:.1f}° from the given start: another place, a wrong start, or a wrong "
+            "calibration"
         )
         return LocalisationStatus.NOT_HERE, message
     if fits_decoy_as_well(solution, decoys):

@@ -8,7 +8,7 @@ import numpy as np
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.records.localisation import OdometryScale
-from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.drive import Drive, as_pose
 from l2m_gtsam.slam.map_prediction import MapPrediction
 
 REJECTED_WEIGHT = 1e-6  # below this a reading counts as rejected
@@ -74,6 +74,13 @@ class DriveSolution:
     def scale_error(self) -> float:
         """Relative error of odometry's lengths: true ones are ``1 + scale_error`` times as long."""
         return 0.0 if self.scale is None else self.scale.longer
+
+    @property
+    def start_chi2(self) -> float:
+        """Mean square of the whitened components by which the first pose differs from the start."""
+        start = self.drive.start
+        off = gtsam.Pose3.Logmap(as_pose(start.T_map_lidar).between(self.poses[0]))
+        return float(off @ np.linalg.solve(start.covariance, off) / len(off))
 
     @property
     def bent(self) -> float:

@@ -76,6 +76,18 @@ class DipoleWorld:
         )
 
 
+class BoundedWorld(DipoleWorld):
+    """A map that knows nothing east of x = 2 m, and says so as maps of files do."""
+
+    def query(self, points: FloatArray) -> FieldSample:
+        sample = super().query(points)
+        inside = points[:, 0] < 2.0
+        hidden = ~inside
+        field, gradient, variance = sample.field, sample.gradient, sample.variance
+        field[hidden], gradient[hidden], variance[hidden] = np.nan, np.nan, np.inf
+        return FieldSample(field, gradient, variance, inside)
+
+
 def dipole_world(seed: int, count: int = 40) -> DipoleWorld:
     """Return dipoles under and over the floor of a 12 x 12 m hall."""
     rng = np.random.default_rng(seed)

@@ -13,10 +13,16 @@ from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.calibration.optimise import Optimizer, covariance_by_qr, joint_covariance
 from l2m_gtsam.calibration.view import observe
-from l2m_gtsam.data import FieldSample, FloatArray, KnownSensor
+from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.records.error_budget import EXPLAINED
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
-from tests.worlds.exact import DipoleWorld, dipole_world, drive, random_sensors
+from tests.worlds.exact import (
+    BoundedWorld,
+    DipoleWorld,
+    dipole_world,
+    drive,
+    random_sensors,
+)
 
 
 def errors(solution: OneKeySolution, sensors: tuple[KnownSensor, ...]) -> FloatArray:
@@ -112,18 +118,6 @@ def test_a_uniform_field_determines_no_position() -> None:
     assert np.isfinite(np.diag(found.covariance)[3:]).all()
     np.testing.assert_allclose(solution.estimate.t, start, atol=1e-9)
     np.testing.assert_allclose(errors(solution, sensors)[0, 3:], 0, atol=1e-5)
-
-
-class BoundedWorld(DipoleWorld):
-    """A map that knows nothing east of x = 2 m."""
-
-    def query(self, points: FloatArray) -> FieldSample:
-        sample = super().query(points)
-        inside = points[:, 0] < 2.0
-        hidden = ~inside
-        field, gradient, variance = sample.field, sample.gradient, sample.variance
-        field[hidden], gradient[hidden], variance[hidden] = np.nan, np.nan, np.inf
-        return FieldSample(field, gradient, variance, inside)
 
 
 def test_readings_outside_the_map_are_left_out() -> None:

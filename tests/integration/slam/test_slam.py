@@ -13,14 +13,16 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.localisation import localise
-from l2m_gtsam.slam.misfit import DecoyMap
+from l2m_gtsam.slam.localisation import in_decoy, localise
+from l2m_gtsam.slam.misfit import DecoyMap, begins_elsewhere, decoy_maps
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
+from l2m_gtsam.slam.pose_graph import solve_pose_graph
+from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.slam.solution import DriveSolution
 from tests.drives.slam import COARSE, WIDE, SlamDrive, calibrated, small_hall
 from tests.support.pose_errors import position_error
-from tests.worlds.exact import dipole_world
+from tests.worlds.exact import BoundedWorld, dipole_world
 
 
 def located(
@@ -118,6 +120,38 @@ def test_a_decoy_without_a_solution_is_no_evidence_for_the_map(
     sensors, drive = small_hall(14, seconds=12)
     result = located(drive, dipole_world(1), calibrated(sensors))
     assert any("in 0 of 2 decoys" in note for note in result.notes)
+
+
+def test_a_drive_has_a_solution_in_decoys_of_a_map_that_ends() -> None:
+    """Poses go beyond a map that is wrong: the test against decoys must not end there."""
+    inner = dipole_world(1)
+    world = BoundedWorld(inner.uniform, inner.positions, inner.moments)
+    sensors, drive = small_hall(14, seconds=20)
+    options = SlamOptions.model_validate({"key_poses": COARSE})
+    solved = localise(drive.recording, world, calibrated(sensors), options, silent).solution.drive
+    found = [in_decoy(solved, each, options) for each in decoy_maps(solved, world)]
+    assert all(each is not None for each in found)
+
+
+def test_a_map_that_fits_badly_and_only_from_another_start_is_of_another_place() -> None:
+    """A rough map alone is none, nor is a start that was given inexactly."""
+    sensors, drive = small_hall(14, seconds=20)
+    options = SlamOptions.model_validate({"key_poses": COARSE})
+    right = localise(drive.recording, dipole_world(1), calibrated(sensors), options, silent)
+    good, start = right.solution, right.solution.drive.start
+    away = replace(start.T_map_lidar, t=start.T_map_lidar.t + np.array([0.9, 0.0, 0.0]))
+    moved = replace(good.drive, start=replace(start, T_map_lidar=away))
+    rough = replace(good, squared=2 * good.squared)
+    assert good.start_chi2 < 1
+    assert not begins_elsewhere(rough)
+    assert not begins_elsewhere(replace(good, drive=moved))
+    both = replace(rough, drive=moved)
+    assert begins_elsewhere(both)
+    links = solve_pose_graph(moved, 0.99)
+    result = localisation_result(moved, both, links, None)
+    assert result.status is LocalisationStatus.NOT_HERE
+    assert "and the drive would begin 0.89 m" in result.message
+    assert "from the given start: another place" in result.message
 
 
 def test_a_start_elsewhere_can_be_given() -> None:

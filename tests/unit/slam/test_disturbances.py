@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from l2m_gtsam.slam.disturbances import ReadingFits, changed
 from l2m_gtsam.slam.misfit import DecoyMap
 from tests.support.central_differences import slopes
-from tests.worlds.exact import dipole_world
+from tests.worlds.exact import BoundedWorld, dipole_world
 
 KEY_POSES, SENSORS, READINGS = 200, 3, 3
 
@@ -71,4 +71,16 @@ def test_a_map_that_is_half_turned_has_the_field_of_the_other_side(seed: int) ->
     _, gradient = turned.field_and_gradient(x)
     # Central differences of fields that bend over decimetres.
     expected = slopes(lambda points: turned.query(points).field, x, 1e-5)
+    np.testing.assert_allclose(gradient, expected, atol=1e-4)
+
+
+def test_a_map_that_is_half_turned_goes_on_beyond_its_data_as_the_map_does() -> None:
+    """Solvers query places that the map does not know: numbers, not NaN."""
+    inner, x = dipole_world(3), np.array([[-3.0, 0.5, 0.4], [3.0, 0.5, 0.4]])
+    world = BoundedWorld(inner.uniform, inner.positions, inner.moments)
+    turned = DecoyMap(world, np.zeros(3))
+    assert turned.query(x).inside.tolist() == [False, True]
+    field, gradient = turned.field_and_gradient(x)
+    np.testing.assert_allclose(field, inner.query(x * [-1, -1, 1]).field, atol=1e-12)
+    expected = slopes(lambda points: inner.query(points * [-1, -1, 1]).field, x, 1e-5)
     np.testing.assert_allclose(gradient, expected, atol=1e-4)
