@@ -55,6 +55,12 @@ class Whitening:
         values, vectors = values[informative], vectors[:, informative]
         return cls(own, A @ (vectors * np.sqrt((1 - 1 / np.sqrt(1 + values)) / values)))
 
+    @property
+    def log_determinant(self) -> float:
+        """Of the matrix, so that densities of white residuals become those of residuals in uT."""
+        left = np.eye(self.common.shape[1]) - self.common.T @ self.common
+        return float(np.linalg.slogdet(self.own)[1].sum() + np.linalg.slogdet(left)[1])
+
     def checked(self, count: int) -> "Whitening":
         """Return a copy for so many readings that is nobody else's.
 

@@ -12,6 +12,7 @@ class EventKind(StrEnum):
     OUT_OF_ORDER = "out_of_order"
     ODOMETRY_GAP = "odometry_gap"
     ODOMETRY_JUMP = "odometry_jump"
+    GAP_DECIDED = "gap_decided"
     JUMP_DECIDED = "jump_decided"
     SENSOR_SILENT = "sensor_silent"
     SENSOR_STUCK = "sensor_stuck"

@@ -50,6 +50,7 @@ from l2m_gtsam.slam.pose_graph import (
 from l2m_gtsam.solve.robust import RobustOptions
 
 POSITION, DISTORTION = 3, 12  # components of a sensor's variables
+AXES = 3
 SECTION = 200  # key poses that are solved together
 GROUP = 10  # key poses that are added to iSAM2 together,
 EARLY = 30  # but the first ones one by one: readings are not linear in calibrations far off
@@ -141,6 +142,7 @@ class Follower:
         self._past = gtsam.Values()
         self.seen = self.used = 0  # readings so far
         self.fixes_refused = 0
+        self.log_likelihood = 0.0  # of readings and scans so far, each against being an outlier
         self._section = Section(self._calibrations)
         self._belief, self._pending = self._prior(start), self._opening(start)
         self._drift = TrackedDrift.at_start(over_m, self._belief)
@@ -171,6 +173,16 @@ class Follower:
         own._belief, own._pending, own._drift = belief, PendingKeyPoses(), last.drift
         own._first = own._last = number
         own._section.add(prior, values, number, 0)
+        return own
+
+    def forked(self) -> "Follower":
+        """Return another follower that goes on from the last key pose."""
+        self.finish()
+        own = Follower.resumed(
+            self.last, self._map, self._robust, self._drift.over_m, free=self._free
+        )
+        own.seen, own.used, own.fixes_refused = self.seen, self.used, self.fixes_refused
+        own.log_likelihood = self.log_likelihood
         return own
 
     @property
@@ -244,13 +256,17 @@ class Follower:
         """Update by the scan fixes of a key pose that pass the gate; return whether one does."""
         most, passed = self._robust.largest_of(POSE), False
         for row in np.flatnonzero(links.in_map).tolist():
-            covariance = self._belief.pose_covariance + links.covariance[row]
+            own = links.covariance[row]
+            covariance = self._belief.pose_covariance + own
             off = gtsam.Pose3.Logmap(link_pose(links, row).between(self._belief.pose))
-            if off @ np.linalg.solve(covariance, off) > most:
+            squared = off @ np.linalg.solve(covariance, off)
+            if squared > most:
                 self.fixes_refused += 1
             else:
-                measure = partial(fix_measurement, link_pose(links, row), links.covariance[row])
+                measure = partial(fix_measurement, link_pose(links, row), own)
                 self._belief, passed = self._belief.updated(measure), True
+                volume = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(own)[1]
+                self.log_likelihood += 0.5 * (most - squared - volume)
                 self._pending.graph.add(link_factor(links, row))
         return passed
 
@@ -277,6 +293,10 @@ class Follower:
         if not len(gated.rows):
             return belief
         updated = update(measurement.of(gated.rows), gated.own, belief)
+        # An outlier is as likely as a reading at the end of what passes for noise.
+        noise = belief.sensors.noise[of_step.readings.sensor[gated.rows]]
+        of_outliers = -np.sum(0.5 * self._robust.largest + AXES * np.log(noise))
+        self.log_likelihood += updated.log_likelihood - float(of_outliers)
         step = StepError(before, updated.belief.step, updated.by_step)
         readings = of_step[gated.rows].shifted(updated.belief.step)
         self._pending.accepted.append(AcceptedReadings(readings, updated.whitening, step))

@@ -353,7 +353,7 @@ class Intake:
             key_pose = self._between(poses, row, number, waiting)
             covariance = key_pose.covariance + suspect.covariance
             key_pose = replace(key_pose, covariance=covariance, lost=suspect.lost)
-            if suspect.replaced:
+            if suspect.doubtful:
                 key_pose = replace(key_pose, recorded=recorded)
         if taken:
             key_pose = replace(key_pose, scans=scans_at(taken, trajectory_of(poses), row))

@@ -67,8 +67,9 @@ class ArrivedKeyPose:
         Standard deviation of odometry's steady drift along each axis of the frame of the poses as a
         share of the distance, shape (3,). 0 for none.
     recorded
-        The same key pose by the step that odometry recorded, where this one goes on with the motion
-        before, for the recorded step is far from it.
+        The same key pose by the step that odometry recorded with its stated error, where that is in
+        doubt: this one goes on with the motion before, which is far from it, or is more uncertain,
+        as odometry was silent.
     """
 
     number: int
@@ -89,6 +90,21 @@ class ArrivedKeyPose:
     def step(self) -> gtsam.Pose3:
         """The step from the key pose before."""
         return gtsam.Pose3(gtsam.Rot3(self.R), self.p)
+
+    @property
+    def is_over_gap(self) -> bool:
+        """Whether the step is as recorded, and in doubt as odometry was silent over it."""
+        recorded = self.recorded
+        if recorded is None:
+            return False
+        return np.array_equal(self.p, recorded.p) and np.array_equal(self.R, recorded.R)
+
+    @property
+    def as_recorded(self) -> "ArrivedKeyPose":
+        """The same with the step as recorded, where it is in doubt over a gap."""
+        if self.recorded is None or not self.is_over_gap:
+            return self
+        return replace(self.recorded, links=self.links)
 
     @property
     def length_m(self) -> float:

@@ -5,6 +5,7 @@ from functools import partial
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from l2m_factors import KeyPoseReadings, KeyPoseResiduals, Whitening, key_pose_residuals
 from l2m_gtsam.calibration.view import QueryableMap
@@ -222,11 +223,14 @@ class Updated:
         Of the n residuals together.
     by_step
         Derivatives of the residuals by a right perturbation of the step, shape (n, 3, 6).
+    log_likelihood
+        Of the n readings by the prior, but for a constant of each.
     """
 
     belief: PredictedBelief
     whitening: Whitening
     by_step: FloatArray
+    log_likelihood: float
 
 
 def gate(
@@ -277,14 +281,25 @@ def update(measurement: StepMeasurement, own: FloatArray, belief: PredictedBelie
         Prior.
     """
     at, step = belief, measurement.step
-    for _ in range(MAX_RELINEARISATIONS):
+    for again in range(MAX_RELINEARISATIONS):
         prediction = measurement.predicted(at)
         white = bridge_whitening(own, prediction.by_end, step.readings.fraction, step.covariance)
-        posterior = belief.updated(partial(whitened_measurement, measurement, white))
+        measure = partial(whitened_measurement, measurement, white)
+        if not again:
+            likely = white.log_determinant + log_density(measure(belief), belief.covariance)
+        posterior = belief.updated(measure)
         if posterior.is_near(at, CONVERGED):
             break
         at = posterior
-    return Updated(posterior, white, prediction.by_step)
+    return Updated(posterior, white, prediction.by_step, likely)
+
+
+def log_density(measured: WhitenedMeasurement, P: FloatArray) -> float:
+    """Return the log density of a measurement at a belief of covariance P, but for constants."""
+    J = measured.jacobian
+    factor = np.linalg.cholesky(J @ P @ J.T + np.eye(len(J)))
+    white = solve_triangular(factor, measured.residual, lower=True)
+    return float(-0.5 * white @ white - np.log(np.diag(factor)).sum())
 
 
 def belief_covariance(

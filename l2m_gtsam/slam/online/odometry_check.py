@@ -4,7 +4,8 @@ Off line a step is compared with those before and after it (:mod:`l2m_gtsam.reco
 odometry_jumps`); here those after are not known. A step that the motion before does not explain may
 be a slip or motion: it counts as uncertain by its whole difference ``d`` from the motion before,
 ``covariance + d d^T``, so that readings decide. Over a gap the vehicle may have gone on while
-odometry did not, and may have turned: there it is as uncertain along all axes.
+odometry did not, and may have turned: there it is as uncertain along all axes; or odometry was
+silent alone, and its step is right.
 """
 
 from dataclasses import dataclass
@@ -39,8 +40,8 @@ class SuspectStep:
         Added to the step's, shape (6, 6).
     lost
         Whether the vehicle may be anywhere near: it had moved, and odometry stood still.
-    replaced
-        Whether the motion before goes on instead of the recorded step.
+    doubtful
+        Whether the step may as well be as recorded, with no more than its stated error.
     """
 
     kind: EventKind
@@ -48,7 +49,7 @@ class SuspectStep:
     end: RigidTransform
     covariance: FloatArray
     lost: bool = False
-    replaced: bool = False
+    doubtful: bool = False
 
     @property
     def is_gap(self) -> bool:
@@ -89,15 +90,20 @@ def suspect_step(
     most_deg = max(jumps.rotation_deg, jumps.acceleration_deg_s2 * reach)
     most_m = max(jumps.position_m, jumps.acceleration_m_s2 * reach)
     if gap:
+        # A turn that had just begun need not go on: the way that was due counts, wherever it led.
+        due = seconds * float(np.linalg.norm(motion[3:])) if known else 0.0
+        gone = float(np.linalg.norm(step.translation()))
+        shift = max(shift, due - gone)
         text = (
             f"odometry has a gap of {seconds:.1f} s: readings in it are left out, and the step "
-            f"over it is uncertain by {shift:.2f} m and {turn:.1f} deg, by which the motion before "
+            f"over it may be off by {shift:.2f} m and {turn:.1f} deg, by which the motion before "
             "differs"
         )
-        gone, due = (np.linalg.norm(each.translation()) for each in (step, expected))
-        lost = bool(shift > FAR_M and gone < STOOD_STILL * due)
+        far = shift > FAR_M or turn > FAR_DEG
+        lost = shift > FAR_M and gone < STOOD_STILL * due
         covariance = isotropic_covariance(turn, shift)
-        return SuspectStep(EventKind.ODOMETRY_GAP, text, after.T, covariance, lost)
+        doubtful = far and not lost
+        return SuspectStep(EventKind.ODOMETRY_GAP, text, after.T, covariance, lost, doubtful)
     if turn <= most_deg and shift <= most_m:
         return None
     if shift > FAR_M or turn > FAR_DEG:
@@ -108,7 +114,7 @@ def suspect_step(
         end = as_pose(before.T).compose(expected)
         T = as_transform(end)
         covariance = isotropic_covariance(most_deg, most_m) + np.outer(d, d)
-        return SuspectStep(EventKind.ODOMETRY_JUMP, text, T, covariance, replaced=True)
+        return SuspectStep(EventKind.ODOMETRY_JUMP, text, T, covariance, doubtful=True)
     text = (
         f"odometry jumps by {shift:.2f} m and {turn:.1f} deg: a slip or a pivot, the step is as "
         "uncertain"

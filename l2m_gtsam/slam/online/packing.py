@@ -18,9 +18,9 @@ from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import FixedStep
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.online.scan_matching import KeptScan, LoopMatcher
+from l2m_gtsam.slam.online.step_doubts import StepDecision
 from l2m_gtsam.slam.online.tracked_drift import DriftPrior, TrackedDrift, WaySinceAnchor
 from l2m_gtsam.slam.unknown_field.field_filter import FilterState
-from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldState, SolvedBeginning
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
@@ -122,6 +122,27 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
     return found
 
 
+def packed_both_ways(name: str, key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
+    """Return key poses as arrays under a name, and their recorded steps where these are others."""
+    recorded = [each.recorded for each in key_poses if each.recorded is not None]
+    return {
+        **named(name, packed_key_poses(key_poses)),
+        **named("recorded", packed_key_poses(recorded)),
+    }
+
+
+def unpacked_both_ways(name: str, arrays: Arrays) -> list[ArrivedKeyPose]:
+    """Return key poses of ``packed_both_ways``; older states may have no recorded steps."""
+    of_recorded = under("recorded", arrays)
+    recorded = (
+        {each.number: each for each in unpacked_key_poses(of_recorded)} if of_recorded else {}
+    )
+    return [
+        replace(each, recorded=recorded.get(each.number))
+        for each in unpacked_key_poses(under(name, arrays))
+    ]
+
+
 def packed_drift(tracked: TrackedDrift) -> Arrays:
     """Return a tracked drift as arrays."""
     way, both = tracked.way, (tracked.before, tracked.known)
@@ -212,11 +233,9 @@ def resume_loops(matcher: LoopMatcher, arrays: Arrays) -> None:
 
 def packed_one_field(state: OneFieldState) -> Arrays:
     """Return a state as arrays."""
-    recorded = [each.recorded for each in state.key_poses if each.recorded is not None]
     decisions = [[each.number, each.was_motion] for each in state.decisions]
     arrays = {
-        **named("key_poses", packed_key_poses(state.key_poses)),
-        **named("recorded", packed_key_poses(recorded)),
+        **packed_both_ways("key_poses", state.key_poses),
         "learnt_m": np.array([state.learnt_m]),
         "decisions": np.reshape(np.array(decisions, dtype=np.int64), (-1, 2)),
     }
@@ -229,19 +248,14 @@ def packed_one_field(state: OneFieldState) -> Arrays:
 
 def unpacked_one_field(arrays: Arrays) -> OneFieldState:
     """Return the state of ``packed_one_field``."""
-    recorded = {each.number: each for each in unpacked_key_poses(under("recorded", arrays))}
-    key_poses = tuple(
-        replace(each, recorded=recorded.get(each.number))
-        for each in unpacked_key_poses(under("key_poses", arrays))
-    )
     decisions = arrays["decisions"].tolist()
     prior, beginning = under("prior", arrays), under("beginning", arrays)
     return OneFieldState(
-        key_poses,
+        tuple(unpacked_both_ways("key_poses", arrays)),
         _unpacked_prior(prior) if prior else None,
         _unpacked_beginning(beginning) if beginning else None,
         float(arrays["learnt_m"][0]),
-        tuple(JumpDecision(number, bool(was_motion)) for number, was_motion in decisions),
+        tuple(StepDecision(number, bool(was_motion)) for number, was_motion in decisions),
     )
 
 

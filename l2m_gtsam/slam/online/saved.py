@@ -19,7 +19,8 @@ from l2m_gtsam.slam.online.begun_with import (
     packed_map,
     packed_sensors,
 )
-from l2m_gtsam.slam.online.belief import Belief
+from l2m_gtsam.slam.online.belief import POSE, Belief
+from l2m_gtsam.slam.online.branches import Branch, BranchedFollower, GapDoubt
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower, LastBelief
 from l2m_gtsam.slam.online.intake import Intake, IntakeState
@@ -28,6 +29,7 @@ from l2m_gtsam.slam.online.odometry_pose import OdometryPose
 from l2m_gtsam.slam.online.packing import (
     Arrays,
     named,
+    packed_both_ways,
     packed_drift,
     packed_gaussian,
     packed_key_poses,
@@ -36,6 +38,7 @@ from l2m_gtsam.slam.online.packing import (
     packed_poses,
     resume_loops,
     under,
+    unpacked_both_ways,
     unpacked_drift,
     unpacked_gaussian,
     unpacked_key_poses,
@@ -78,9 +81,9 @@ def saved_state(slam: OnlineSlam) -> SavedState:
     if isinstance(slam.matcher, LoopMatcher):
         arrays |= named("loops", packed_loops(slam.matcher))
     estimator, search = slam.estimator, slam.search
-    if isinstance(estimator, Follower):
+    if isinstance(estimator, BranchedFollower):
         facts["stage"] = FOLLOWING
-        arrays |= named("belief", _packed_follower(estimator))
+        arrays |= named("belief", _packed_branches(estimator))
     elif isinstance(estimator, Explorer):
         facts["stage"] = EXPLORING
         arrays |= named("explorer", _packed_explorer(estimator, facts))
@@ -192,9 +195,24 @@ def _resume_searching(slam: OnlineSlam, arrays: Arrays) -> None:
     slam.search = StartSearchState(first, waiting, float(arrays["window_m"][0]))
 
 
-def _packed_follower(follower: Follower) -> Arrays:
-    follower.finish()
-    last = follower.last
+def _packed_branches(branched: BranchedFollower) -> Arrays:
+    best, *others = branched.branches
+    at = [[number, each.stamp_ns] for number, each in branched.doubts.items()]
+    arrays = {
+        **_packed_branch(best),
+        "doubt.at": np.array(at, dtype=np.int64).reshape(-1, 2),
+        "doubt.covariance": np.reshape(
+            [each.covariance for each in branched.doubts.values()], (-1, POSE, POSE)
+        ),
+    }
+    for i, each in enumerate(others):
+        arrays |= named(f"other.{i}", _packed_branch(each))
+    return arrays
+
+
+def _packed_branch(branch: Branch) -> Arrays:
+    branch.follower.finish()
+    last = branch.follower.last
     sensors = last.belief.sensors
     return {
         **packed_poses([last.belief.pose]),
@@ -202,31 +220,48 @@ def _packed_follower(follower: Follower) -> Arrays:
         "t": sensors.t,
         "distortion": sensors.distortion,
         "number": np.array([last.number], dtype=np.int64),
+        "recorded": np.array(sorted(branch.recorded), dtype=np.int64),
+        "log_likelihood": np.array([branch.follower.log_likelihood]),
         **named("drift", packed_drift(last.drift)),
     }
 
 
 def _resume_following(slam: OnlineSlam, arrays: Arrays) -> None:
+    count = len({name.split(".")[1] for name in arrays if name.startswith("other.")})
+    others = [_unpacked_branch(slam, under(f"other.{i}", arrays)) for i in range(count)]
+    # Older states have no doubts.
+    doubts = {}
+    if "doubt.at" in arrays:
+        both = zip(arrays["doubt.at"].tolist(), arrays["doubt.covariance"], strict=True)
+        doubts = {number: GapDoubt(stamp, own) for (number, stamp), own in both}
+    slam.estimator = BranchedFollower(_unpacked_branch(slam, arrays), *others, doubts=doubts)
+
+
+def _unpacked_branch(slam: OnlineSlam, arrays: Arrays) -> Branch:
     sensors = replace(slam.sensors, t=arrays["t"], distortion=arrays["distortion"])
     belief = Belief(unpacked_poses(arrays)[0], sensors, arrays["covariance"])
     options = slam.options
     over_m, own = options.drift.over_m, under("drift", arrays)
     # Older states have none: it is found again.
     drift = unpacked_drift(own, over_m) if own else TrackedDrift.at_start(over_m, belief)
-    slam.estimator = Follower.resumed(
+    follower = Follower.resumed(
         LastBelief(int(arrays["number"][0]), belief, drift),
         slam.known_map(),
         options.robust,
         over_m,
         free=options.calibration is CalibrationUse.REFINED,
     )
+    if "recorded" not in arrays:
+        return Branch(follower)
+    follower.log_likelihood = float(arrays["log_likelihood"][0])
+    return Branch(follower, frozenset(arrays["recorded"].tolist()))
 
 
 def _packed_explorer(explorer: Explorer, facts: dict[str, Any]) -> Arrays:
     state = explorer.state()
     arrays = named("start", _packed_start(explorer.start))
     if state.prior is None:
-        return {**arrays, **named("waiting", packed_key_poses(state.waiting))}
+        return {**arrays, **packed_both_ways("waiting", state.waiting)}
     facts["field"] = {
         "hyperparameters": state.prior.hyperparameters.model_dump(mode="json"),
         "resolution": [state.prior.resolution.floor, state.prior.resolution.ceiling],
@@ -254,7 +289,7 @@ def _packed_explorer(explorer: Explorer, facts: dict[str, Any]) -> Arrays:
 def _resume_exploring(slam: OnlineSlam, arrays: Arrays, facts: dict[str, Any]) -> None:
     start = _unpacked_start(under("start", arrays))
     if "field" not in facts:
-        waiting = tuple(unpacked_key_poses(under("waiting", arrays)))
+        waiting = tuple(unpacked_both_ways("waiting", arrays))
         state = ExplorerState(None, FieldMemory.at_start(start), (), waiting, 0)
     else:
         state = _unpacked_memory(slam, arrays, facts["field"])
@@ -302,7 +337,7 @@ def _packed_intake(state: IntakeState) -> Arrays:
     }
     for stamp, each in state.suspect.items():
         own = {"R": each.end.R, "p": each.end.t, "covariance": each.covariance}
-        own["flags"] = np.array([each.lost, each.replaced], dtype=np.int64)
+        own["flags"] = np.array([each.lost, each.doubtful], dtype=np.int64)
         arrays |= named(f"suspect.{stamp}", own)
     for i, buffer in enumerate(state.sensors):
         flags = [buffer.last_ns, buffer.same, buffer.silent, buffer.stuck, buffer.disordered]

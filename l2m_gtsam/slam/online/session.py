@@ -26,6 +26,7 @@ from l2m_gtsam.slam.held_calibration import with_calibration_use
 from l2m_gtsam.slam.localisation import is_determined, known_sensors, start_pose
 from l2m_gtsam.slam.online.arguments import refuse_unusable
 from l2m_gtsam.slam.online.belief import Belief
+from l2m_gtsam.slam.online.branches import Branch, BranchedFollower, GapDoubt
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.intake import Intake
@@ -33,9 +34,9 @@ from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose, trajectory_of
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanLinks, ScanMatcher
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, refuse_offline_only
+from l2m_gtsam.slam.slips import FAR_M
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
-from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 
 MOST_WAITING = 2000  # key poses of a start search: of a vehicle that turns on the spot
@@ -51,6 +52,7 @@ IMPOSSIBLE = (
     "follow odometry until the field is learnt anew"
 )
 REFUSED, FITS = 0.4, 0.6  # share that is explained, below which it is reported, and above again
+Estimator = BranchedFollower | Explorer | OneFieldExplorer
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,7 @@ class OnlineSlam:
         axes = None if field_map is None else np.array([1.0, 1.0, options.drift.of_height])
         # The axes of the one field are the first key pose's, of which none need be vertical.
         self.intake = Intake(self.sensors, options, np.ones(3) if self._one_field else axes)
-        self.estimator: Follower | Explorer | OneFieldExplorer | None = None
+        self.estimator: Estimator | None = None
         self.search: StartSearchState | None = None
         self.base, self.stamp_ns = 0, 0  # number of the first key pose, time of the last
         self._counts: deque[tuple[int, int]] = deque(maxlen=LAST_KEY_POSES)
@@ -204,6 +206,7 @@ class OnlineSlam:
             if self.estimator is None:
                 return tuple(found)
         last = OnlinePose.of(self.stamp_ns, self.estimator.finish())
+        self._report_decided(self.estimator)
         return (*(each for each in found if each.stamp_ns < last.stamp_ns), last)
 
     def events(self) -> tuple[OnlineEvent, ...]:
@@ -239,10 +242,11 @@ class OnlineSlam:
         window_m = self.options.start.search.window_m
         return StartSearchState(start_pose(first, self.options.start), waiting, window_m)
 
-    def _follower(self, start: StartPose) -> Follower:
+    def _follower(self, start: StartPose) -> BranchedFollower:
         free, robust = self.options.calibration is CalibrationUse.REFINED, self.options.robust
         over_m = self.options.drift.over_m
-        return Follower(start, self.sensors, self.known_map(), robust, over_m, free=free)
+        follower = Follower(start, self.sensors, self.known_map(), robust, over_m, free=free)
+        return BranchedFollower(Branch(follower))
 
     @property
     def field_map(self) -> QueryableMap | None:
@@ -263,7 +267,7 @@ class OnlineSlam:
 
     def _added(self, key_pose: ArrivedKeyPose) -> Iterator[OnlinePose]:
         """Yield the key poses that are known by a new one."""
-        following = isinstance(self.estimator, Follower)
+        following = isinstance(self.estimator, BranchedFollower)
         if key_pose.lost and following and isinstance(self._map, Surveyed):
             self._lose(key_pose)
             return
@@ -271,13 +275,17 @@ class OnlineSlam:
             self._begin_search(key_pose)  # no pattern of readings reaches over it
             return
         if self.search is not None:
-            self.search.waiting.append(key_pose)
+            # No pose is followed yet, which could be so both ways.
+            one_way = replace(key_pose, recorded=None) if key_pose.is_over_gap else key_pose
+            self.search.waiting.append(one_way)
             if self.search.is_silent():
                 self._begin_search(key_pose)
                 return
             yield from self._searched(self.search, at_end=False)
             return
-        yield self._estimated(key_pose)
+        pose = self._estimated(key_pose)
+        if self.search is None:  # else it is the first of a search
+            yield pose
 
     def _lose(self, key_pose: ArrivedKeyPose) -> None:
         """Search for the place of a key pose that odometry does not know, with what is known."""
@@ -302,14 +310,18 @@ class OnlineSlam:
             return OnlinePose.of(key_pose.stamp_ns, self._explored(estimator, key_pose))
         if estimator is None:
             raise ConfigError("the drive has not begun")
-        seen, used, refused = estimator.seen, estimator.used, estimator.fixes_refused
-        key_pose = self._with_fixes(estimator, key_pose)
-        belief = estimator.add(key_pose)
-        estimator.release()
-        if estimator.fixes_refused > refused:
+        before = estimator.best
+        seen, used, refused = before.seen, before.used, before.fixes_refused
+        belief, best = estimator.add(self._with_fixes(estimator, key_pose)), estimator.best
+        if best.fixes_refused > refused:
             text = "a scan is left out: it contradicts odometry and readings"
             self._report(EventKind.SCAN_REFUSED, text)
-        self._count(estimator.seen - seen, estimator.used - used)
+        if key_pose.is_over_gap:
+            self._counts.clear()
+        self._count(best.seen - seen, best.used - used)
+        wrong = self._wrong_over_gaps(estimator)
+        if any(each.off_m > FAR_M for each in wrong) and isinstance(self._map, Surveyed):
+            self._lose(key_pose)
         return OnlinePose.of(key_pose.stamp_ns, belief)
 
     def _explored(self, explorer: Explorer | OneFieldExplorer, key_pose: ArrivedKeyPose) -> Belief:
@@ -318,21 +330,50 @@ class OnlineSlam:
         if isinstance(explorer, Explorer):
             key_pose = self._with_loops(explorer, key_pose)
         belief = explorer.add(key_pose)
-        if isinstance(explorer, OneFieldExplorer):
-            for each in explorer.decisions():
-                self._report(EventKind.JUMP_DECIDED, decision_text(each, explorer.key_poses))
-            if explorer.has_refused():
-                self._report(EventKind.CORRECTION_REFUSED, IMPOSSIBLE)
+        self._report_decided(explorer)
+        if isinstance(explorer, OneFieldExplorer) and explorer.has_refused():
+            self._report(EventKind.CORRECTION_REFUSED, IMPOSSIBLE)
         if explorer.is_learnt and not learnt:
             text = "strength and depth of the field's sources are learnt: poses are corrected"
             self._report(EventKind.FIELD_LEARNT, text)
         return belief
 
-    def _with_fixes(self, follower: Follower, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
+    def _wrong_over_gaps(self, estimator: BranchedFollower) -> list[GapDoubt]:
+        """Return gaps whose step readings have just refuted, alone or with all it may have been."""
+        total, good = (sum(each) for each in zip(*self._counts, strict=True))
+        if not estimator.doubts or (total < LEAST_READINGS and len(self._counts) < LAST_KEY_POSES):
+            return []
+        if good < REFUSED * total:
+            return list(estimator.doubts.values())
+        decisions = estimator.decisions()
+        for each, was_right in decisions:
+            self._report_gap(each.stamp_ns, was_right=was_right)
+        return [each for each, was_right in decisions if not was_right]
+
+    def _report_decided(self, estimator: Estimator) -> None:
+        """Report what the readings say of steps that were in doubt."""
+        if isinstance(estimator, OneFieldExplorer):
+            for each in estimator.decisions():
+                key_pose = estimator.key_poses[each.number]
+                if key_pose.is_over_gap:
+                    self._report_gap(key_pose.stamp_ns, was_right=each.was_motion)
+                else:
+                    text = jump_text(key_pose.stamp_ns, each.was_motion)
+                    self._report(EventKind.JUMP_DECIDED, text)
+        elif isinstance(estimator, Explorer):
+            for at_ns, was_right in estimator.decisions().items():
+                self._report_gap(at_ns, was_right=was_right)
+
+    def _report_gap(self, at_ns: int, *, was_right: bool) -> None:
+        was = "right" if was_right else "wrong, or odometry errs by more than it states"
+        text = f"the step over the gap of odometry until {1e-9 * at_ns:.3f} s was {was}"
+        self._report(EventKind.GAP_DECIDED, f"{text}, by the readings")
+
+    def _with_fixes(self, follower: BranchedFollower, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
         """Return a key pose with what its scans say of its place in the map."""
         if not isinstance(self.matcher, ScanMatcher) or not key_pose.scans:
             return key_pose
-        expected = expected_place(follower.belief, follower.expected(key_pose))
+        expected = expected_place(follower.belief, follower.best.expected(key_pose))
         found = self.matcher.fixes(key_pose.scans, key_pose.number, expected, key_pose.length_m)
         return self._linked(key_pose, found)
 
@@ -411,8 +452,7 @@ def expected_place(before: Belief, key_pose: ArrivedKeyPose) -> PoseEstimate:
     return PoseEstimate(as_transform(predicted.pose), predicted.pose_covariance)
 
 
-def decision_text(decision: JumpDecision, key_poses: Sequence[ArrivedKeyPose]) -> str:
+def jump_text(at_ns: int, was_motion: bool) -> str:
     """Return what the readings say of a jump of odometry."""
-    seconds = 1e-9 * key_poses[decision.number].stamp_ns
-    was = "motion, as recorded" if decision.was_motion else "a slip: the motion before went on"
-    return f"the jump of odometry at {seconds:.3f} s was {was}, by the readings"
+    was = "motion, as recorded" if was_motion else "a slip: the motion before went on"
+    return f"the jump of odometry at {1e-9 * at_ns:.3f} s was {was}, by the readings"

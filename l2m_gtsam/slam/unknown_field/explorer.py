@@ -10,7 +10,7 @@ The correlations between tiles are essential: tiles that count as independent, o
 drift as odometry does, and the sigmas do not show it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -25,9 +25,11 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_transform
 from l2m_gtsam.slam.links import Links, carried_on, seen_from_before
 from l2m_gtsam.slam.marginals import reported_ill_conditioning
-from l2m_gtsam.slam.online.belief import Belief
+from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
+from l2m_gtsam.slam.online.step_doubts import CERTAIN
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
+from l2m_gtsam.slam.slips import SLIPPED
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory
 from l2m_gtsam.slam.unknown_field.open_section import OpenSection
 from l2m_gtsam.slam.unknown_field.read_path import ReadPath
@@ -131,6 +133,10 @@ class Explorer:
         self._past: list[MarginalizedPose] = []
         self._belief = self._prior()
         self._section: OpenSection | None = None
+        self._other: OpenSection | None = None  # the less likely where steps over gaps are in doubt
+        self._doubts: list[int] = []  # times of their ends
+        self._recorded = True  # whether these are as recorded in the likelier section
+        self._decisions: dict[int, bool] = {}
 
     @property
     def memory(self) -> FieldMemory:
@@ -235,6 +241,11 @@ class Explorer:
         past = [now.pose(each.anchor).compose(each.T_anchor_key) for each in self._past]
         return [*past, *(now.pose(k) for k in range(len(past), self._solved + 1))]
 
+    def decisions(self) -> dict[int, bool]:
+        """Return whether steps over gaps were right, by the times of their ends, of new ones."""
+        found, self._decisions = self._decisions, {}
+        return found
+
     @property
     def is_learnt(self) -> bool:
         """Whether the prior of the field is learnt; until then poses are those of odometry."""
@@ -305,23 +316,56 @@ class Explorer:
         """Solve the last stretch with what is waiting, and begin another if it is long."""
         group, path_m = [self._tied(each) for each in self._waiting], self._path_m
         self._waiting = []
-        yield from section.extended(group)
+        self._doubts += [each.stamp_ns for each in group if each.is_over_gap]
+        if self._doubts:
+            section, belief = yield from self._both_ways(section, group)
+        else:
+            yield from section.extended(group)
+            belief = section.belief()
         last = group[-1].number
         if self._is_done(section, last, path_m):
             yield from self._handing_over(section, last, path_m)
             belief = self._memory.belief(last, self._sensors)
-        else:
-            belief = section.belief()
         self._solved, self._solved_m = last, path_m
         for each in self._waiting:
             belief = belief.predicted(each.step, each.covariance).marginalize_previous()
         self._belief = belief
         self._reckoned = {k: each for k, each in self._reckoned.items() if k > self._solved}
 
+    def _both_ways(
+        self, section: OpenSection, group: Sequence[ArrivedKeyPose]
+    ) -> Generator[None, None, tuple[OpenSection, Belief]]:
+        """Solve with steps over gaps as recorded, and as uncertain; return the likelier section."""
+        recorded = [each.as_recorded for each in group]
+        own, others = (recorded, list(group)) if self._recorded else (list(group), recorded)
+        if self._other is None:
+            self._other, others = section.begun_anew(), [*section.key_poses, *others]
+        yield from section.extended(own)
+        yield from self._other.extended(others)
+        odds = section.log_likelihood() - self._other.log_likelihood()
+        odds += SLIPPED if self._recorded else -SLIPPED
+        yield
+        if odds < 0:
+            section, self._other, self._recorded = self._other, section, not self._recorded
+            self._section = section
+        belief, rest = section.belief(), self._other.belief()
+        apart = gtsam.Pose3.Logmap(belief.pose.between(rest.pose))
+        covariance = belief.covariance.copy()
+        share = 1 / (1 + np.exp(abs(odds)))  # of the other
+        covariance[:POSE, :POSE] += share * (rest.pose_covariance + np.outer(apart, apart))
+        belief = replace(belief, covariance=covariance)
+        if abs(odds) > CERTAIN:
+            self._decisions |= dict.fromkeys(self._doubts, self._recorded)
+            self._end_doubts()
+        return section, belief
+
+    def _end_doubts(self) -> None:
+        self._other, self._doubts, self._recorded = None, [], True
+
     def _is_done(self, section: OpenSection, last: int, path_m: float) -> bool:
         """Return whether a section ends here, and is not solved again when key poses come."""
         count, long_m = last - self._first, path_m - self._opened_m
-        settled = count >= FEW and section.moved_m < self._pace.settled_m
+        settled = not self._doubts and count >= FEW and section.moved_m < self._pace.settled_m
         return settled or count >= SECTION or long_m >= self._pace.section_m
 
     def _tied(self, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
@@ -339,6 +383,7 @@ class Explorer:
 
     def _handing_over(self, section: OpenSection, last: int, path_m: float) -> Iterator[None]:
         """Marginalise the key poses up to the last but anchors, and begin another section."""
+        self._end_doubts()  # what nothing has decided stays as it is likelier
         memory = yield from section.closed()
         for k in range(len(self._past), last + 1):
             anchor = section.tile(k).anchor

@@ -1,11 +1,5 @@
-"""What a drive may be where its odometry jumps, each followed by a filter of its own.
+"""What a drive may be where odometry is in doubt, each followed by a filter of its own."""
 
-A step far from the motion before it is a slip, or motion that odometry caught up with, as after a
-gap of the poses. Fields between both ends say nothing about either, so that each is followed apart,
-and the likelihood of the readings decides.
-"""
-
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -13,12 +7,10 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+from l2m_gtsam.slam.online.step_doubts import likely, shares
 from l2m_gtsam.slam.relative_motion import from_end
 from l2m_gtsam.slam.slips import SLIPPED
 from l2m_gtsam.slam.unknown_field.field_filter import FieldFilter, FilterState, FilterStep
-
-MOST = 4  # hypotheses: of two jumps that nothing has decided yet
-CERTAIN = 7.0  # nats, a thousand to one
 
 
 @dataclass(frozen=True)
@@ -32,7 +24,7 @@ class Hypothesis:
     poses
         All key poses, in the frame of the field.
     recorded
-        Numbers of the key poses to which the step was as recorded, of those at a jump.
+        Numbers of the key poses to which the step was as recorded, of those in doubt.
     """
 
     state: FilterState
@@ -43,22 +35,6 @@ class Hypothesis:
     def log_odds(self) -> float:
         """Log likelihood, and what speaks for recorded steps before any reading."""
         return self.state.log_likelihood + SLIPPED * len(self.recorded)
-
-
-@dataclass(frozen=True)
-class JumpDecision:
-    """What a jump of odometry was.
-
-    Attributes
-    ----------
-    number
-        Of the key pose behind it.
-    was_motion
-        Whether the vehicle moved as odometry recorded.
-    """
-
-    number: int
-    was_motion: bool
 
 
 @dataclass(frozen=True)
@@ -102,45 +78,26 @@ class Hypotheses:
             Of its step, where there is a recorded one beside it: what was decided before, None if
             nothing.
         """
-        steps = []  # with the jumps that are motion by them
+        steps = []  # with those in doubt that are motion by them
         if key_pose.recorded is None or not was_motion:
             steps.append((step_of(key_pose), frozenset[int]()))
         if key_pose.recorded is not None and was_motion is not False:
             steps.append((step_of(key_pose.recorded), frozenset({key_pose.number})))
         found = []
         for each in self.all:
-            for step, jumps in steps:
+            for step, own in steps:
                 state = follows.after(each.state, step)
-                recorded = each.recorded | jumps
+                recorded = each.recorded | own
                 found.append(Hypothesis(state, (*each.poses, state.pose), recorded))
         return Hypotheses(tuple(likely(found)))
 
-    def decided(self, numbers: Sequence[int]) -> tuple[JumpDecision, ...]:
-        """Return those of some jumps in which all agree."""
-        found = []
-        for number in numbers:
-            said = {number in each.recorded for each in self.all}
-            if len(said) == 1:
-                found.append(JumpDecision(number, said.pop()))
-        return tuple(found)
-
     def pose_covariance(self) -> FloatArray:
         """Return the covariance of the likeliest pose, with what speaks for others, (6, 6)."""
-        odds = np.array([each.log_odds for each in self.all])
-        share = np.exp(odds - odds.max())
-        share = share / share.sum()
         total = np.zeros((6, 6))
-        for weight, each in zip(share, self.all, strict=True):
+        for weight, each in zip(shares(self.all), self.all, strict=True):
             apart = gtsam.Pose3.Logmap(self.best.state.pose.between(each.state.pose))
             total += weight * (each.state.pose_covariance + np.outer(apart, apart))
         return total
-
-
-def likely(found: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the hypotheses that are worth following, the likeliest first."""
-    ranked = sorted(found, key=lambda each: -each.log_odds)
-    least = ranked[0].log_odds - CERTAIN
-    return [each for each in ranked[:MOST] if each.log_odds >= least]
 
 
 def step_of(key_pose: ArrivedKeyPose) -> FilterStep:

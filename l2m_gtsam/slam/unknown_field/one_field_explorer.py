@@ -27,14 +27,10 @@ from l2m_gtsam.maps.training import FEWEST
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose, stacked
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
+from l2m_gtsam.slam.online.step_doubts import StepDecision, decided
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.field_filter import DeadReckoning, FieldFilter, FilterState
-from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
-    Hypotheses,
-    Hypothesis,
-    JumpDecision,
-    step_of,
-)
+from l2m_gtsam.slam.unknown_field.odometry_hypotheses import Hypotheses, Hypothesis, step_of
 from l2m_gtsam.slam.unknown_field.read_path import ReadPath
 from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, SmoothedDrive, end_state, smoothed
 from l2m_gtsam.slam.unknown_field.whole_field import (
@@ -68,7 +64,7 @@ class SolvedBeginning:
     state
         At the last of them.
     recorded
-        Numbers of the key poses to which the step was as recorded, of those at a jump.
+        Numbers of the key poses to which the step was as recorded, of those in doubt.
     """
 
     poses: tuple[gtsam.Pose3, ...]
@@ -91,14 +87,14 @@ class OneFieldState:
     learnt_m
         Path at which it was learnt, metres.
     decisions
-        What jumps of odometry were.
+        What steps in doubt were.
     """
 
     key_poses: tuple[ArrivedKeyPose, ...]
     prior: WholePrior | None
     beginning: SolvedBeginning | None
     learnt_m: float
-    decisions: tuple[JumpDecision, ...]
+    decisions: tuple[StepDecision, ...]
 
 
 @dataclass(frozen=True)
@@ -131,9 +127,9 @@ class OneFieldExplorer:
         self._reckoned = DeadReckoning.at_start()
         self._now: FollowedField | None = None
         self._work: Iterator[FollowedField | None] | None = None
-        self._open: list[int] = []  # jumps that are not decided
-        self._decisions: dict[int, JumpDecision] = {}
-        self._news: list[JumpDecision] = []
+        self._open: list[int] = []  # steps in doubt that are not decided
+        self._decisions: dict[int, StepDecision] = {}
+        self._news: list[StepDecision] = []
         self._has_refused = False
 
     @property
@@ -192,8 +188,8 @@ class OneFieldExplorer:
         field = np.einsum("nij,nj->ni", axes, corrected)
         return points @ R.T + self._origin.translation(), field @ R.T
 
-    def decisions(self) -> tuple[JumpDecision, ...]:
-        """Return what jumps of odometry were, of those decided since the last call."""
+    def decisions(self) -> tuple[StepDecision, ...]:
+        """Return what steps in doubt were, of those decided since the last call."""
         found, self._news = self._news, []
         return tuple(found)
 
@@ -221,8 +217,8 @@ class OneFieldExplorer:
             own._dead_reckon(each)
         own._decisions = {each.number: each for each in state.decisions}
         own._key_poses = list(state.key_poses)
-        jumps = [each.number for each in state.key_poses if each.recorded is not None]
-        own._open = [number for number in jumps if number not in own._decisions]
+        doubts = [each.number for each in state.key_poses if each.recorded is not None]
+        own._open = [number for number in doubts if number not in own._decisions]
         own._learnt_m = state.learnt_m
         if state.prior is not None:
             own._work = own._following(state.prior, state.beginning)
@@ -252,13 +248,13 @@ class OneFieldExplorer:
 
     @property
     def _recorded(self) -> frozenset[int]:
-        """Key poses at jumps whose steps are likeliest as recorded."""
+        """Key poses whose steps in doubt are likeliest as recorded."""
         if self._now is None:
             return frozenset()
         return self._now.hypotheses.best.recorded
 
     def _drive(self, count: int) -> Drive:
-        """Return so many key poses, jumps as they are likeliest to be."""
+        """Return so many key poses, steps in doubt as they are likeliest to be."""
         recorded = self._recorded
         chosen = [
             each if each.recorded is None or each.number not in recorded else each.recorded
@@ -280,7 +276,7 @@ class OneFieldExplorer:
     def _learning(self, now: FollowedField | None) -> Iterator[FollowedField | None]:
         """Solve the drive so far, and follow the rest, in pieces."""
         self._learnt_m = self._path_m
-        # A jump that nothing has decided yet is followed both ways.
+        # A step that nothing has decided yet is followed both ways.
         count = min([len(self._key_poses), *self._open])
         recorded = frozenset(each for each in self._recorded if each < count)
         drive = self._drive(count)
@@ -367,7 +363,7 @@ class OneFieldExplorer:
 
     def _decide(self, hypotheses: Hypotheses) -> None:
         """Keep what all hypotheses agree on."""
-        for each in hypotheses.decided(self._open):
+        for each in decided(hypotheses.all, self._open):
             self._open.remove(each.number)
             self._decisions[each.number] = each
             self._news.append(each)

@@ -27,7 +27,7 @@ from l2m_gtsam.slam.map_prediction import (
     place_readings,
     sensors_in,
 )
-from l2m_gtsam.slam.marginals import joint_posterior
+from l2m_gtsam.slam.marginals import Marginals, joint_posterior
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.options import SlamOptions
@@ -98,6 +98,37 @@ class OpenSection:
     def moved_m(self) -> float:
         """How far readings moved one of the key poses when they were solved last, at most."""
         return self._moved_m
+
+    @property
+    def key_poses(self) -> Sequence[ArrivedKeyPose]:
+        """All after the first."""
+        return self._key_poses
+
+    def begun_anew(self) -> "OpenSection":
+        """Return the same section without key poses, as which other ones may be solved."""
+        return OpenSection(
+            self._sensors,
+            self._field_prior,
+            self._options,
+            self._memory,
+            self._first,
+            self._tiles_before,
+        )
+
+    def log_likelihood(self) -> float:
+        """Return that of its readings, poses and field integrated out about the solution.
+
+        Sections from one memory whose steps differ are compared by it.
+        """
+        graph = self._factors(self._counted)
+        prior = self._memory.known.marginal(self._shared)
+        graph.push_back(prior_factors(prior))
+        left = Marginals(graph.linearize(self._values), colamd_ordering(graph)).log_determinant()
+        known = np.linalg.slogdet(prior.covariance)[1]
+        known += sum(np.linalg.slogdet(each.covariance)[1] for each in self._key_poses)
+        largest = self._options.robust.largest
+        volume = sum(each.log_volume(self._sensors, largest) for each in self._counted)
+        return float(volume - graph.error(self._values) - left - 0.5 * known)
 
     def extended(self, new: Sequence[ArrivedKeyPose]) -> Iterator[None]:
         """Add key poses and solve.

@@ -8,6 +8,7 @@ import numpy as np
 
 from l2m_factors import Calibrations, KeyPoseReadings, TileBlocks
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction
 from l2m_gtsam.slam.pose_graph import successive
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
@@ -89,6 +90,26 @@ class TileReadings:
         readings = of_section.readings[laid.rows[chosen]]
         blocks = TileBlocks(laid.number, laid.anchor, laid.field, readings, W, of_section.fixed)
         return cls(laid, chosen, variance[chosen] / weights[chosen, None], blocks)
+
+    def log_volume(self, sensors: KnownSensors, largest: float) -> float:
+        """Return what the log likelihood of the n readings has beside squares of their residuals.
+
+        Each is counted against an outlier, which is as likely as a reading at the end of what
+        passes for noise.
+
+        Parameters
+        ----------
+        sensors
+            Calibrations.
+        largest
+            Squared length of a whitened residual at that end.
+        """
+        noise = sensors.noise[self.laid.placed.readings.sensor[self.chosen]]
+        return float(
+            AXES * np.log(noise).sum()
+            - 0.5 * np.log(self.variance).sum()
+            + 0.5 * largest * len(self.chosen)
+        )
 
     def factors(self) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the readings' factors of poses and weights."""

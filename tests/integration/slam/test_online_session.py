@@ -7,8 +7,8 @@ import pytest
 
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.slam.localisation import prepared
+from l2m_gtsam.slam.online.branches import BranchedFollower
 from l2m_gtsam.slam.online.events import EventKind
-from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, key_poses_of
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose
 from l2m_gtsam.slam.online.replay import FieldReading, give, messages
@@ -16,7 +16,7 @@ from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
-from tests.drives.lost import QUICK, lost_drive, searching
+from tests.drives.lost import lost_drive, searching
 from tests.drives.online import (
     OPTIONS,
     Hall,
@@ -27,11 +27,9 @@ from tests.drives.online import (
     seconds_of,
     with_readings,
 )
-from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, slam_drive
+from tests.drives.slam import COARSE, calibrated, laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
-from tests.worlds.surveyed import strange_hall, surveyed, wandering
-
-GAP = (200, 260)  # rows of odometry
+from tests.worlds.surveyed import strange_hall, surveyed
 
 
 @pytest.fixture(scope="module")
@@ -103,58 +101,6 @@ def test_a_sensor_that_dies_and_returns_is_reported_and_does_no_harm(
     assert sensors[1].sensor in run.events[2].text
     assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.05
     assert run.nees(drive.truth)[1:].mean() < 12
-
-
-def with_gap(drive: SlamDrive, goes_on: bool) -> list[OdometryPose | FieldReading]:
-    """Return a drive without odometry for three seconds, which has gone on, or has stood still."""
-    odometry, first, last = drive.recording.trajectory, *GAP
-    before, after = (RigidTransform(odometry.R[k], odometry.p[k]) for k in GAP)
-    found: list[OdometryPose | FieldReading] = []
-    for message in messages(drive.recording):
-        if not isinstance(message, OdometryPose):
-            found.append(message)
-            continue
-        row = int(np.searchsorted(odometry.stamp_ns, message.stamp_ns))
-        if first < row < last:
-            continue
-        T = message.T
-        if row >= last and not goes_on:  # all that follows continues from where it stood
-            R = before.R @ after.R.T
-            T = RigidTransform(R @ T.R, R @ (T.t - after.t) + before.t)
-        found.append(replace(message, T=T))
-    return found
-
-
-def test_a_gap_of_odometry_is_reported_and_its_sigma_says_so(
-    hall: Hall,
-) -> None:
-    """Odometry has gone on meanwhile: the pose after it is as far off as its sigma says."""
-    run, truth = driven(in_map(hall), with_gap(hall[1], goes_on=True)), hall[1].truth
-    assert EventKind.ODOMETRY_GAP in run.kinds
-    at_end = int(np.searchsorted(run.trajectory().stamp_ns, truth.stamp_ns[GAP[1]]))
-    sigma = np.sqrt(np.trace(run.poses[at_end].covariance[3:, 3:]))
-    assert run.off(truth)[at_end] < 4 * sigma
-    assert run.nees(truth)[1:].mean() < 12
-    assert run.off(truth)[-10:].max() < 0.1
-
-
-def test_where_odometry_stood_still_over_a_gap_the_place_is_searched_for() -> None:
-    """The vehicle went on by 1.8 m, odometry did not: no pose comes out until its place is found.
-
-    With a prior as wide as what it may have driven a filter found a wrong place, and was sure.
-    """
-    world, rng = strange_hall(0), np.random.default_rng(0)
-    sensors = random_sensors(0, 2)
-    drive = slam_drive(world, sensors, wandering(rng, 40.0), rng)
-    options = SlamOptions.model_validate({"key_poses": COARSE, "start": {"search": QUICK}})
-    slam = OnlineSlam(calibrated(sensors), options, surveyed(world))
-    run, truth = driven(slam, with_gap(drive, goes_on=False)), drive.truth
-    gap = run.kinds.index(EventKind.ODOMETRY_GAP)
-    assert run.kinds[gap + 1 :][0] is EventKind.START_OPEN
-    assert run.kinds[-1] is EventKind.START_FOUND
-    assert run.nees(truth)[1:].mean() < 12
-    assert run.off(truth)[-10:].max() < 0.1
-    assert run.trajectory().stamp_ns[-1] == truth.stamp_ns[-1]
 
 
 def test_a_vehicle_in_another_place_is_reported(
@@ -231,7 +177,7 @@ def test_refined_calibrations_are_handed_out_with_what_is_known_of_them_then(
     recorded = slam_drive(world, sensors, laps(25, (1.9, 1.4)), np.random.default_rng(3))
     slam = OnlineSlam(known, options, world if has_map else None)
     last = driven(slam, messages(recorded.recording)).poses[-1]
-    assert isinstance(slam.estimator, Explorer | Follower)
+    assert isinstance(slam.estimator, Explorer | BranchedFollower)
     own = slam.estimator.belief.calibration_covariance
     np.testing.assert_array_equal(last.sensors.covariance, own)
     assert last.covariance.base is None  # of the whole covariance, which it would keep

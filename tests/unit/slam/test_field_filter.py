@@ -15,6 +15,7 @@ from l2m_gtsam.slam.key_pose_readings import no_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import FixedStep
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+from l2m_gtsam.slam.online.step_doubts import CERTAIN, MOST, decided, likely
 from l2m_gtsam.slam.unknown_field.field_filter import (
     NO_DRIFT,
     DeadReckoning,
@@ -22,13 +23,7 @@ from l2m_gtsam.slam.unknown_field.field_filter import (
     FilterState,
     FilterStep,
 )
-from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
-    CERTAIN,
-    MOST,
-    Hypotheses,
-    Hypothesis,
-    likely,
-)
+from l2m_gtsam.slam.unknown_field.odometry_hypotheses import Hypotheses, Hypothesis
 from l2m_gtsam.slam.unknown_field.whole_field import WholeField
 
 NOISE_UT, WAVES, STEPS = 0.5, 60, 25
@@ -156,7 +151,7 @@ def test_hypotheses_end_where_readings_speak_against_them() -> None:
 def test_a_jump_is_decided_where_all_agree_and_doubt_is_in_the_covariance() -> None:
     one, other = hypothesis(0.0, 5, 9), hypothesis(3.0, 5, at=2.0)  # 3 nats speak for each jump
     both = Hypotheses((one, other))
-    assert [(each.number, each.was_motion) for each in both.decided([5, 9])] == [(5, True)]
+    assert [(each.number, each.was_motion) for each in decided(both.all, [5, 9])] == [(5, True)]
     # Equally likely, 2 m apart: half of 2^2 along x.
     assert both.pose_covariance()[3, 3] == pytest.approx(1e-2 + 0.5 * 4.0)
     assert both.pose_covariance()[4, 4] == pytest.approx(1e-2)
