@@ -79,6 +79,9 @@ def test_whitening_makes_covariances_the_identity(seed: int, n: int, common: int
     whole = white(half.T.reshape(n, 3, 3 * n))
     # Beside a thousandth: rounding of covariances a million times as large as the noise.
     np.testing.assert_allclose(whole, np.eye(3 * n), atol=2e-3)
+    # Each error that is left out has so little of it.
+    volume = np.linalg.slogdet(S + F @ F.T)[1]
+    assert -2 * white.log_determinant == pytest.approx(volume, abs=2e-3 * (1 + common))
 
 
 def test_what_is_known_of_a_step_shifts_the_readings() -> None:
