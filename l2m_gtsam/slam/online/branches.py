@@ -17,11 +17,10 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.follower import Follower
-from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+from l2m_gtsam.slam.online.key_pose import WRONG, ArrivedKeyPose
 from l2m_gtsam.slam.online.step_doubts import decided, likely, ranked
 from l2m_gtsam.slam.slips import SLIPPED
 
-WRONG = float(1 / (1 + np.exp(SLIPPED)))  # how probable a wrong step is before any reading
 LONGEST = 200  # key poses, after which what nothing has decided stays as it is likelier
 
 

@@ -16,8 +16,10 @@ from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
 from l2m_gtsam.slam.key_pose_readings import joined_readings, no_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import FixedStep, OdometrySteps
+from l2m_gtsam.slam.slips import SLIPPED
 
 POSE = 6
+WRONG = float(1 / (1 + np.exp(SLIPPED)))  # how probable a wrong step over a gap is before readings
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,14 @@ class ArrivedKeyPose:
         if self.recorded is None or not self.is_over_gap:
             return self
         return replace(self.recorded, links=self.links)
+
+    @property
+    def as_mixture(self) -> "ArrivedKeyPose":
+        """The same with the covariance of both steps by their prior odds, over a gap in doubt."""
+        if not self.is_over_gap:
+            return self
+        one = self.as_recorded
+        return replace(one, covariance=one.covariance + WRONG * self.covariance)
 
     @property
     def length_m(self) -> float:

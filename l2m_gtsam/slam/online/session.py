@@ -33,6 +33,7 @@ from l2m_gtsam.slam.online.intake import Intake
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose, trajectory_of
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanLinks, ScanMatcher
+from l2m_gtsam.slam.online.step_doubts import StepDecision
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, refuse_offline_only
 from l2m_gtsam.slam.slips import FAR_M
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
@@ -354,12 +355,7 @@ class OnlineSlam:
         """Report what the readings say of steps that were in doubt."""
         if isinstance(estimator, OneFieldExplorer):
             for each in estimator.decisions():
-                key_pose = estimator.key_poses[each.number]
-                if key_pose.is_over_gap:
-                    self._report_gap(key_pose.stamp_ns, was_right=each.was_motion)
-                else:
-                    text = jump_text(key_pose.stamp_ns, each.was_motion)
-                    self._report(EventKind.JUMP_DECIDED, text)
+                self._report(EventKind.JUMP_DECIDED, decision_text(each, estimator.key_poses))
         elif isinstance(estimator, Explorer):
             for at_ns, was_right in estimator.decisions().items():
                 self._report_gap(at_ns, was_right=was_right)
@@ -452,7 +448,8 @@ def expected_place(before: Belief, key_pose: ArrivedKeyPose) -> PoseEstimate:
     return PoseEstimate(as_transform(predicted.pose), predicted.pose_covariance)
 
 
-def jump_text(at_ns: int, was_motion: bool) -> str:
+def decision_text(decision: StepDecision, key_poses: Sequence[ArrivedKeyPose]) -> str:
     """Return what the readings say of a jump of odometry."""
-    was = "motion, as recorded" if was_motion else "a slip: the motion before went on"
-    return f"the jump of odometry at {1e-9 * at_ns:.3f} s was {was}, by the readings"
+    seconds = 1e-9 * key_poses[decision.number].stamp_ns
+    was = "motion, as recorded" if decision.was_motion else "a slip: the motion before went on"
+    return f"the jump of odometry at {seconds:.3f} s was {was}, by the readings"

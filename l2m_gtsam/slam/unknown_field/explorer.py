@@ -359,6 +359,15 @@ class Explorer:
             self._end_doubts()
         return section, belief
 
+    def _undecided(self, section: OpenSection) -> Generator[None, None, OpenSection]:
+        """Solve with the covariance of both ways, where a section ends before one is decided."""
+        uncertain = section if self._other is None or not self._recorded else self._other
+        both = section.begun_anew()
+        yield from both.extended([each.as_mixture for each in uncertain.key_poses])
+        self._section = both
+        self._end_doubts()
+        return both
+
     def _end_doubts(self) -> None:
         self._other, self._doubts, self._recorded = None, [], True
 
@@ -383,7 +392,8 @@ class Explorer:
 
     def _handing_over(self, section: OpenSection, last: int, path_m: float) -> Iterator[None]:
         """Marginalise the key poses up to the last but anchors, and begin another section."""
-        self._end_doubts()  # what nothing has decided stays as it is likelier
+        if self._doubts:
+            section = yield from self._undecided(section)
         memory = yield from section.closed()
         for k in range(len(self._past), last + 1):
             anchor = section.tile(k).anchor

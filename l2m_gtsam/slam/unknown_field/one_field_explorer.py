@@ -144,6 +144,7 @@ class OneFieldExplorer:
 
     def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior."""
+        key_pose = key_pose.as_mixture
         self._key_poses.append(key_pose)
         self._count_path(key_pose)
         if key_pose.recorded is not None:

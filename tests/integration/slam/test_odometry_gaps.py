@@ -116,3 +116,21 @@ def test_without_a_map_odometry_that_was_silent_alone_is_believed(seed: int) -> 
     assert "was right, by the readings" in told
     assert run.off(drive.truth).max() < 0.3
     assert run.nees(drive.truth)[1:].mean() < 12
+
+
+def test_without_a_map_a_wrong_step_that_nothing_decides_is_left_open() -> None:
+    """Odometry says 2.5 m aside, where the vehicle has not been and no memory speaks against it.
+
+    With the stated error alone NEES is 2,000: as a Gaussian of 5 % for a wrong step has it, 40.
+    """
+    sensors, rng = random_sensors(0, 2), np.random.default_rng(0)
+    options = SlamOptions.model_validate(
+        {
+            "key_poses": {"distance_m": 0.3, "readings": 2},
+            "tiles": {"modes": 60, "learn_over_m": 6.0},
+        }
+    )
+    drive = slam_drive(dipole_world(0), sensors, laps(60, (1.9, 1.4)), rng)
+    run = driven(OnlineSlam(calibrated(sensors), options), with_gap(drive, (500, 580), ASIDE))
+    assert EventKind.GAP_DECIDED not in run.kinds
+    assert run.nees(drive.truth)[1:].mean() < 100
