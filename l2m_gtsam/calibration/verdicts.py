@@ -192,7 +192,7 @@ def _solved(
     rotation = _no_rotation()
     axis = dead_axis(distortion.C)
     # what is not determined, or fits no place, may be short without a fault of the sensor
-    fits = found.sensor not in solution.stayed
+    fits = not (solution.contradicted or found.sensor in solution.stayed)
     if fits and axis and np.isfinite(found.covariance[3:12, 3:12].diagonal()).all():
         status = SensorStatus.DEAD_AXIS
         message = f"the sensor's {axis} axis does not follow the field; check its wiring"
@@ -259,6 +259,11 @@ def _verdict(
         )
     if words:
         return SensorStatus.UNDETERMINED, open_
+    if solution.contradicted:
+        return SensorStatus.CONTRADICTED, (
+            "hardly anything of what the map predicts is in its readings: is it the map of this "
+            "place, and are the poses in its frame?"
+        )
     if runs_away:
         return SensorStatus.NOT_CONVERGED, (
             "no place near where it started explains its readings: the solve leaves the map"
