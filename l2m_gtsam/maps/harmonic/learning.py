@@ -33,6 +33,8 @@ from l2m_gtsam.parallel.threads import in_threads
 ROUNDS = 2  # learning is repeated while it asks for finer modes than it looked at
 BOUND_TOLERANCE = 1e-6
 FURTHEST = np.log(300.0)  # from where a search starts
+NOISIER = 10.0  # times the usual noise, from where it starts again
+BETTER = 1.0  # nats: less is the same maximum
 
 
 class LearningOptions(Options):
@@ -59,7 +61,7 @@ class LearningEnd:
     hyperparameters
         Scales in uT and depths in metres of largest likelihood.
     log_likelihood
-        Sum over the windows, nats; absent where the hyperparameters were given.
+        Sum over the windows, nats; NaN where the hyperparameters were given.
     readings
         Number of readings in all windows.
     converged
@@ -71,7 +73,7 @@ class LearningEnd:
     """
 
     hyperparameters: Hyperparameters
-    log_likelihood: float | None
+    log_likelihood: float
     readings: int
     converged: bool
     at_bound: tuple[str, ...]
@@ -80,7 +82,7 @@ class LearningEnd:
     @property
     def described(self) -> str:
         """In a few words."""
-        if self.log_likelihood is None:
+        if np.isnan(self.log_likelihood):
             return "given"
         return learning_words(self.converged, self.at_bound)
 
@@ -129,6 +131,8 @@ def learn(
         looked_at = affordable(resolution_of(guess, density, share), tiling, options.modes)
         windows = draw_windows(readings, sources, looked_at, tiling, options)
         end = maximise(windows.spread, guess)
+        if end.at_bound:
+            end = likelier(windows.spread, end, starting_point(readings))
         finest = resolution_of(end.hyperparameters, density, share)
         needed = affordable(finest, tiling, options.modes)
         guess = end.hyperparameters
@@ -136,6 +140,26 @@ def learn(
         if needed.floor < FINER * looked_at.floor and needed.ceiling < FINER * looked_at.ceiling:
             break
     return replace(end, roughest=tuple(own(each, end.hyperparameters) for each in windows.rough))
+
+
+def likelier(windows: Sequence[Window], end: LearningEnd, usual: Hyperparameters) -> LearningEnd:
+    """Return the likelier end of a search that ran into a bound, and of one from more noise.
+
+    Where noise is much larger than where a search starts its first steps are long: a side of the
+    field then ends as good as not there, where no slope leads back.
+
+    Parameters
+    ----------
+    windows
+        Where to search.
+    end
+        On a bound.
+    usual
+        From where a search starts.
+    """
+    noisier = usual.model_copy(update={"noise": NOISIER * usual.noise})
+    other = maximise(windows, noisier)
+    return other if other.log_likelihood > end.log_likelihood + BETTER else end
 
 
 def starting_point(readings: TrainingSet) -> Hyperparameters:

@@ -103,7 +103,7 @@ def evenly(rows: IntArray, most: int) -> IntArray:
 def learn_prior(readings: TrainingSet, sources: Sources, options: HarmonicOptions) -> LearningEnd:
     """Return the hyperparameters that are given, or else those that the readings teach."""
     if options.hyperparameters is not None:
-        return LearningEnd(options.hyperparameters, None, 0, converged=True, at_bound=())
+        return LearningEnd(options.hyperparameters, np.nan, 0, converged=True, at_bound=())
     return learn(readings, sources, options.tiling, options.mode_share, options.learning)
 
 
