@@ -10,7 +10,7 @@ from l2m_gtsam.mapping.suite_likelihood import SuiteWindow, undistorted
 from l2m_gtsam.maps.harmonic.basis import COARSE, Basis, basis_of
 from l2m_gtsam.maps.harmonic.evidence import normal_of
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
-from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn
+from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn, maximise
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, Sources
 from l2m_gtsam.maps.harmonic.teaching import learn_map, learn_strengths
@@ -71,7 +71,7 @@ def windows_over(
     survey = merged(raw, defaults.merge, defaults.independent)
     learning = LearningOptions(windows=options.windows, rough=0, modes=options.modes)
     share = defaults.mode_share
-    prior = learn(survey, sources, defaults.tiling, share, learning).hyperparameters
+    prior = learn(survey, sources, defaults.tiling, share, learning, maximise).hyperparameters
     density = float(survey.weight.sum()) / surveyed_area(survey.points)
     wanted = resolution_of(prior, density, share)
     resolution = affordable(wanted, defaults.tiling, learning.modes)

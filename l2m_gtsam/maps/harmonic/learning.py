@@ -1,6 +1,6 @@
 """Learning the hyperparameters: the marginal likelihood of a few windows of the survey."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,7 +61,7 @@ class LearningEnd:
     hyperparameters
         Scales in uT and depths in metres of largest likelihood.
     log_likelihood
-        Sum over the windows, nats; NaN where the hyperparameters were given.
+        Sum over the windows, nats; absent where the hyperparameters were given.
     readings
         Number of readings in all windows.
     converged
@@ -73,7 +73,7 @@ class LearningEnd:
     """
 
     hyperparameters: Hyperparameters
-    log_likelihood: float
+    log_likelihood: float | None
     readings: int
     converged: bool
     at_bound: tuple[str, ...]
@@ -82,7 +82,7 @@ class LearningEnd:
     @property
     def described(self) -> str:
         """In a few words."""
-        if np.isnan(self.log_likelihood):
+        if self.log_likelihood is None:
             return "given"
         return learning_words(self.converged, self.at_bound)
 
@@ -109,6 +109,7 @@ def learn(
     tiling: TilingOptions,
     share: float,
     options: LearningOptions,
+    search: Callable[[Sequence[Window], Hyperparameters], LearningEnd],
 ) -> LearningEnd:
     """Return the hyperparameters that make the readings most likely.
 
@@ -124,15 +125,16 @@ def learn(
         Ratio of variances below which a mode is left out; see ``resolution_of``.
     options
         Number and size of the windows.
+    search
+        ``maximise``, or ``maximise_again`` for surveys: what is learnt along the path of a drive
+        is learnt again as the drive goes on.
     """
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
     guess = starting_point(readings)
     for _ in range(ROUNDS):
         looked_at = affordable(resolution_of(guess, density, share), tiling, options.modes)
         windows = draw_windows(readings, sources, looked_at, tiling, options)
-        end = maximise(windows.spread, guess)
-        if end.at_bound:
-            end = likelier(windows.spread, end, starting_point(readings))
+        end = search(windows.spread, guess)
         finest = resolution_of(end.hyperparameters, density, share)
         needed = affordable(finest, tiling, options.modes)
         guess = end.hyperparameters
@@ -140,26 +142,6 @@ def learn(
         if needed.floor < FINER * looked_at.floor and needed.ceiling < FINER * looked_at.ceiling:
             break
     return replace(end, roughest=tuple(own(each, end.hyperparameters) for each in windows.rough))
-
-
-def likelier(windows: Sequence[Window], end: LearningEnd, usual: Hyperparameters) -> LearningEnd:
-    """Return the likelier end of a search that ran into a bound, and of one from more noise.
-
-    Where noise is much larger than where a search starts its first steps are long: a side of the
-    field then ends as good as not there, where no slope leads back.
-
-    Parameters
-    ----------
-    windows
-        Where to search.
-    end
-        On a bound.
-    usual
-        From where a search starts.
-    """
-    noisier = usual.model_copy(update={"noise": NOISIER * usual.noise})
-    other = maximise(windows, noisier)
-    return other if other.log_likelihood > end.log_likelihood + BETTER else end
 
 
 def starting_point(readings: TrainingSet) -> Hyperparameters:
@@ -244,6 +226,20 @@ def maximise(
         converged=bool(end.success) and not at_bound,
         at_bound=at_bound,
     )
+
+
+def maximise_again(windows: Sequence[Window], start: Hyperparameters) -> LearningEnd:
+    """Return the same; where the search ran into a bound, the likelier of it and of another.
+
+    Where noise is much larger than where a search starts its first steps are long: a side of the
+    field then ends as good as not there, where no slope leads back. The other starts from more.
+    """
+    end = maximise(windows, start)
+    if not end.at_bound:
+        return end
+    other = maximise(windows, start.model_copy(update={"noise": NOISIER * start.noise}))
+    gain = (other.log_likelihood or 0.0) - (end.log_likelihood or 0.0)
+    return other if gain > BETTER else end
 
 
 def learnable(windows: Sequence[Window]) -> list[str]:

@@ -20,7 +20,7 @@ from l2m_gtsam.maps.harmonic.evidence import (
 )
 from l2m_gtsam.maps.harmonic.explanation import explanation_of, patchwork
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
-from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn
+from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn, maximise_again
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
 from l2m_gtsam.maps.harmonic.search import (
     MOST_READINGS,
@@ -103,8 +103,9 @@ def evenly(rows: IntArray, most: int) -> IntArray:
 def learn_prior(readings: TrainingSet, sources: Sources, options: HarmonicOptions) -> LearningEnd:
     """Return the hyperparameters that are given, or else those that the readings teach."""
     if options.hyperparameters is not None:
-        return LearningEnd(options.hyperparameters, np.nan, 0, converged=True, at_bound=())
-    return learn(readings, sources, options.tiling, options.mode_share, options.learning)
+        return LearningEnd(options.hyperparameters, None, 0, converged=True, at_bound=())
+    tiling, share = options.tiling, options.mode_share
+    return learn(readings, sources, tiling, share, options.learning, maximise_again)
 
 
 def with_search(learnt: Learnt, options: HarmonicOptions) -> Learnt:

@@ -11,7 +11,7 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import UNIFORM_SIGMA, Basis
 from l2m_gtsam.maps.harmonic.family import Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
-from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn
+from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn, maximise
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
@@ -91,7 +91,7 @@ def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> 
     if hyperparameters is None:
         learning = LearningOptions(modes=options.modes)
         tiling, share = defaults.tiling, defaults.mode_share
-        learnt = learn(readings, NO_SOURCES, tiling, share, learning)
+        learnt = learn(readings, NO_SOURCES, tiling, share, learning, maximise)
         hyperparameters = learnt.hyperparameters
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
     wanted = resolution_of(hyperparameters, density, defaults.mode_share)
