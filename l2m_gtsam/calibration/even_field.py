@@ -10,10 +10,10 @@ import numpy as np
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.chi_square import quantile
+from l2m_gtsam.solve.closed_form import left_by_any
 
 AXES = 3
 LIMIT = float(quantile(0.999, AXES))  # of what a place explains of noise, so many are below
-
 ALIKE_SIGMAS = 4.0  # of a correlation of n values, which by chance is 1 / sqrt(n)
 
 
@@ -49,10 +49,3 @@ def is_noise(left: FloatArray) -> bool:
     """Return whether neighbours are no more alike than chance makes them, shape (N, 3)."""
     alike = np.sum(left[1:] * left[:-1]) / np.sum(left**2)
     return bool(alike < ALIKE_SIGMAS / np.sqrt(left.size))
-
-
-def left_by_any(b_lidar: FloatArray, field: FloatArray) -> FloatArray:
-    """Return what any C and H leave of readings in uT; all of shape (N, 3)."""
-    A = np.column_stack([b_lidar, np.ones(len(b_lidar))])
-    solution = np.linalg.lstsq(A, field, rcond=None)[0]
-    return np.asarray(A @ solution - field)

@@ -33,6 +33,7 @@ from l2m_gtsam.calibration.optimise import (
 from l2m_gtsam.calibration.pose_errors import at_likely_poses, error_of_poses
 from l2m_gtsam.calibration.priors import Contradiction, contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
+from l2m_gtsam.calibration.stated_sizes import take_all_noise
 from l2m_gtsam.calibration.variance_parts import Parts, by_block
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
@@ -216,7 +217,8 @@ def joint_problem(
     share += by_pose @ by_pose.transpose(0, 2, 1)
     covariance = reading_covariance(estimate.noise[sensor], share, view.trust)
     values, W, readings = estimate.values(view.sensors), whitening(covariance), view.readings
-    if readings.pose_root is not None:
+    noise = estimate.noise[view.sensors]
+    if readings.pose_root is not None and not take_all_noise(noise):
         e = np.einsum("nij,nj->ni", C, view.b_lidar) + estimate.distortion[sensor, 9:]
         white = np.einsum("nij,nj->ni", W, e - readings.field)
         errors = -np.einsum("nij,ni->nj", W @ by_pose, white)

@@ -95,7 +95,12 @@ def leave_noise(stated: Sequence[StatedSize], noise: FloatArray) -> bool:
         Of each sensor, as estimated beside them, uT, shape (S,).
     """
     too_large = any(each.is_wrong and each.ratio < 1 for each in stated)
-    return not (too_large and bool((noise <= NOTHING_LEFT).any()))
+    return not (too_large and take_all_noise(noise))
+
+
+def take_all_noise(noise: FloatArray) -> bool:
+    """Return whether errors of stated sizes leave a sensor no noise, shape (S,) in uT."""
+    return bool((noise <= NOTHING_LEFT).any())
 
 
 def size_of_shared(

@@ -39,7 +39,7 @@ from l2m_gtsam.calibration.optimise import (
 )
 from l2m_gtsam.calibration.pose_errors import at_likely_poses
 from l2m_gtsam.calibration.sensor_columns import columns_of, keys_of
-from l2m_gtsam.calibration.stated_sizes import NOTHING_LEFT
+from l2m_gtsam.calibration.stated_sizes import take_all_noise
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.rank import Determinacy
@@ -311,7 +311,7 @@ class UncertainProblem:
         noise: then these are too large, and what they would correct is noise.
         """
         readings, pose, estimate = self.drive.view.readings, self.noise.pose, self.estimate
-        if pose is None or (estimate.noise[self.drive.view.sensors] <= NOTHING_LEFT).any():
+        if pose is None or take_all_noise(estimate.noise[self.drive.view.sensors]):
             return readings
         errors, residual = np.empty((len(readings), POSE)), self.residual(values)
         groups = self.drive.prior.coverage.groups

@@ -283,7 +283,12 @@ def refitted(b_lidar: FloatArray, readings: FloatArray) -> float:
 
     Both have the shape (N, 3).
     """
+    return float(np.sqrt(np.mean(left_by_any(b_lidar, readings) ** 2)))
+
+
+def left_by_any(b_lidar: FloatArray, readings: FloatArray) -> FloatArray:
+    """Return what any C and H leave of readings at fields ``b_lidar`` in uT; all (N, 3)."""
     A: FloatArray = np.column_stack([b_lidar, np.ones(len(b_lidar))])
     # A vehicle that keeps its heading leaves columns alike; least squares takes the shortest then.
     solution = np.linalg.lstsq(A, readings, rcond=None)[0]
-    return float(np.sqrt(np.mean((A @ solution - readings) ** 2)))
+    return np.asarray(A @ solution - readings)

@@ -16,18 +16,7 @@ from tests.drives.online import (
     OnlineRun,
     driven,
     in_map,
-    online_hall,
 )
-
-
-@pytest.fixture(scope="module")
-def hall() -> Hall:
-    return online_hall()
-
-
-@pytest.fixture(scope="module")
-def plain(hall: Hall) -> OnlineRun:
-    return driven(in_map(hall), messages(hall[1].recording))
 
 
 def test_stamps_out_of_order_are_left_out(hall: Hall, plain: OnlineRun) -> None:

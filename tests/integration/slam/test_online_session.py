@@ -23,23 +23,12 @@ from tests.drives.online import (
     OnlineRun,
     driven,
     in_map,
-    online_hall,
     seconds_of,
     with_readings,
 )
 from tests.drives.slam import COARSE, calibrated, laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.surveyed import strange_hall, surveyed
-
-
-@pytest.fixture(scope="module")
-def hall() -> Hall:
-    return online_hall()
-
-
-@pytest.fixture(scope="module")
-def plain(hall: Hall) -> OnlineRun:
-    return driven(in_map(hall), messages(hall[1].recording))
 
 
 def test_a_drive_is_localised_as_it_comes(hall: Hall, plain: OnlineRun) -> None:

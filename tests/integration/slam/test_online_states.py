@@ -17,20 +17,9 @@ from tests.drives.online import (
     OnlineRun,
     driven,
     in_map,
-    online_hall,
 )
 from tests.drives.slam import calibrated
 from tests.worlds.exact import dipole_world
-
-
-@pytest.fixture(scope="module")
-def hall() -> Hall:
-    return online_hall()
-
-
-@pytest.fixture(scope="module")
-def plain(hall: Hall) -> OnlineRun:
-    return driven(in_map(hall), messages(hall[1].recording))
 
 
 def test_killed_and_resumed_it_goes_on(hall: Hall, plain: OnlineRun, tmp_path: Path) -> None:
