@@ -9,6 +9,7 @@ from l2m_gtsam.calibration.budget.found import Budget
 from l2m_gtsam.calibration.changed_places import solve_changed
 from l2m_gtsam.calibration.coverage import KnowsSurvey
 from l2m_gtsam.calibration.explanation import explained
+from l2m_gtsam.calibration.jumping_solve import solve_jumping
 from l2m_gtsam.calibration.moving_solve import MovingProblem
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.options import CalibrationOptions
@@ -35,6 +36,7 @@ from l2m_gtsam.records.calibration import (
     SensorCalibration,
     SensorStatus,
 )
+from l2m_gtsam.records.error_budget import OffsetJump
 from l2m_gtsam.records.provenance import RecordedDrive, dated
 from l2m_gtsam.solve.explain import movement
 from l2m_gtsam.solve.robust import disagreements
@@ -127,7 +129,8 @@ def calibrated(
         trajectory=recording.trajectory,
         priors=priors,
     )
-    changed = solve_changed(problem, solver_map, t_start, options.changes)
+    jumping = solve_jumping(problem, t_start, options.changes)
+    changed = solve_changed(jumping.problem, solver_map, jumping.outcome, options.changes)
     if changed.sources is not None and is_ambiguous(found, options):
         # Steel that the search did not know of makes one place look like another.
         found = _starts(alive, changed.taken_into(compiled), options, priors, progress)
@@ -169,6 +172,7 @@ def calibrated(
         pose_duration=solution.pose_duration,
         unseen_warp_m=solution.unseen_warp_m,
         sources=changed.records,
+        jumps=tuple(_jump_in_own_time(each, recording) for each in jumping.jumps),
         recorded=tuple(map(_recorded, recording.parts)),
     )
     return Calibrated(result, solution, field_map, solver_map)
@@ -299,6 +303,16 @@ def _in_own_time(stretch: Disagreement, recording: Recording) -> Disagreement:
     drive = recording.drives[drive_at(recording, stretch.start_ns)]
     start, end = (own_ns(recording, each) for each in (stretch.start_ns, stretch.end_ns))
     return replace(stretch, start_ns=start, end_ns=end, bag=drive.source.path)
+
+
+def _jump_in_own_time(jump: OffsetJump, recording: Recording) -> OffsetJump:
+    """Return a jump with the name of its drive, in that one's time."""
+    if not recording.drives:
+        return jump
+    drive = recording.drives[drive_at(recording, jump.stamp_ns)]
+    stamp = own_ns(recording, jump.stamp_ns)
+    seconds = 1e-9 * (stamp - int(drive.trajectory.stamp_ns[0]))
+    return replace(jump, stamp_ns=stamp, seconds=seconds, bag=drive.source.path)
 
 
 def _nothing_solved(

@@ -207,10 +207,10 @@ class ChangedSolve:
 def solve_changed(
     problem: MovingProblem,
     solver_map: RememberedMap,
-    t_start: FloatArray,
+    without: MovingSolution,
     options: ChangesOptions,
 ) -> ChangedSolve:
-    """Solve, look for sources, and solve again with them until both agree.
+    """Look for sources, and solve again with them until both agree.
 
     Parameters
     ----------
@@ -218,12 +218,12 @@ def solve_changed(
         What to solve, on the map as it was surveyed.
     solver_map
         That map.
-    t_start
-        Where to start each sensor in the lidar frame in metres, shape (S, 3).
+    without
+        The solve on it.
     options
         How to look for sources.
     """
-    plain = solved = ChangedSolve(solve_moving(problem, t_start), solver_map, None)
+    plain = solved = ChangedSolve(without, solver_map, None)
     for _ in range(ROUNDS):
         before = None if solved.sources is None else solved.sources.found
         sources = search(solved.outcome.solution, solver_map, options, before)

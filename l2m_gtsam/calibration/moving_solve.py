@@ -157,6 +157,8 @@ class MovingProblem:
         The lidar's poses.
     priors
         What is known of the sensors beforehand.
+    steps
+        Numbers that act on all readings beside the recorded ones, shape (N, J): jumps of H.
     """
 
     readings: Readings
@@ -167,6 +169,7 @@ class MovingProblem:
     progress: Progress
     trajectory: Trajectory | None
     priors: Priors = NO_PRIORS
+    steps: FloatArray | None = None
 
     def solved(self, t_start: FloatArray, fields: Mapping[int, Correction]) -> "Round":
         """Solve with the fields of numbers taken off readings, and compare models.
@@ -178,7 +181,7 @@ class MovingProblem:
         fields
             What numbers add to the readings of the sensors that they act on.
         """
-        given = without(self.readings, fields)
+        given = beside_numbers(without(self.readings, fields), self.steps)
         solution = solve_one_key(
             given,
             self.field_map,
@@ -271,7 +274,8 @@ def _total(
     """Return what was taken off and what the graph found besides; else what the models say."""
     if taken_off is None or left is None:
         return Correction(comparison.coefficients.h, comparison.sigma.h)
-    return Correction(taken_off.h + left.h, left.sigma)
+    own = slice(len(taken_off.h))  # jumps of H come after the recorded numbers
+    return Correction(taken_off.h + left.h[own], left.sigma[own])
 
 
 def solve_moving(problem: MovingProblem, t_start: FloatArray) -> MovingSolution:
@@ -315,6 +319,14 @@ def without(readings: Readings, fields: Mapping[int, Correction]) -> Readings:
         numbers[rows] = readings.regressors[rows]
         B[rows] -= numbers[rows] @ each.h
     return replace(readings, field=B, regressors=numbers)
+
+
+def beside_numbers(readings: Readings, steps: FloatArray | None) -> Readings:
+    """Return readings with more numbers, shape (N, J), beside those that they have."""
+    if steps is None:
+        return readings
+    own = () if readings.regressors is None else (readings.regressors,)
+    return replace(readings, regressors=np.hstack([*own, steps]))
 
 
 def _places(solution: OneKeySolution, t_start: FloatArray) -> FloatArray:

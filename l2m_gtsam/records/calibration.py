@@ -18,6 +18,7 @@ from l2m_gtsam.records.by_sensor import BySensor
 from l2m_gtsam.records.error_budget import (
     EXPLAINED,
     Disturbance,
+    OffsetJump,
     PoseDuration,
     StatedSize,
     Unmodelled,
@@ -404,6 +405,8 @@ class CalibrationResult(BySensor[SensorCalibration]):
         How long errors of poses last; none where these are taken as exact.
     sources
         Of field that came, went or were moved since the place was mapped; the solve includes them.
+    jumps
+        Of H on the drive, in order of time; H is that of the end.
     unseen_warp_m
         Shifts of the drive's frame against the map's that readings leave possible, root mean square
         along each axis of the floor in metres; sigmas include them. Absent where a bend was found.
@@ -434,6 +437,7 @@ class CalibrationResult(BySensor[SensorCalibration]):
     exact: tuple[str, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     sources: tuple[ChangedSource, ...] = ()
+    jumps: tuple[OffsetJump, ...] = ()
     stated: tuple[StatedSize, ...] = ()
     pose_duration: PoseDuration | None = None
     unseen_warp_m: float | None = None

@@ -6,6 +6,8 @@ from enum import StrEnum
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.records.metrics import Row
+from l2m_gtsam.records.record import Record
 
 
 class ErrorCause(StrEnum):
@@ -104,6 +106,33 @@ class Disturbance:
     sizes: dict[str, float]
     gain: float
     sensor: str | None = None
+
+
+MOST_JUMPS = 3  # of H of one sensor on one drive: one that jumps so often wanders
+
+
+@dataclass(frozen=True)
+class OffsetJump(Record):
+    """A jump of H at one moment of a drive.
+
+    Attributes
+    ----------
+    sensor
+        Of which.
+    stamp_ns, seconds
+        When: by its stamps, and after the first reading of the drive.
+    change, sigma
+        H after less before and its standard deviation, uT.
+    bag
+        The drive, where several were calibrated together; then times are its own.
+    """
+
+    sensor: str
+    stamp_ns: int
+    seconds: float
+    change: Row
+    sigma: Row
+    bag: str = ""
 
 
 @dataclass(frozen=True)

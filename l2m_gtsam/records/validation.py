@@ -11,6 +11,7 @@ from typing import Annotated
 from pydantic import AliasChoices, Field
 
 from l2m_gtsam.data import SaturatedAxis
+from l2m_gtsam.records.error_budget import OffsetJump
 from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Row, Series
 from l2m_gtsam.records.places import ChangedSource, WhatChanged
 from l2m_gtsam.records.provenance import NamedSource
@@ -236,27 +237,6 @@ class Displacement(Record):
     turn: Row
     turn_sigma: Row
     gain: float
-
-
-@dataclass(frozen=True)
-class OffsetJump(Record):
-    """A jump of H at one moment of a drive.
-
-    Attributes
-    ----------
-    sensor
-        Of which.
-    stamp_ns, seconds
-        When: by its stamps, and after the first reading of the drive.
-    change, sigma
-        H after less before and its standard deviation, uT.
-    """
-
-    sensor: str
-    stamp_ns: int
-    seconds: float
-    change: Row
-    sigma: Row
 
 
 @dataclass(frozen=True)

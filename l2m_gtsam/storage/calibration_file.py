@@ -112,6 +112,10 @@ MODEL = {
         "follows the vehicle's motion; sizes are standard deviations, gain is twice a logarithm "
         "of likelihood"
     ),
+    "jumps": (
+        "moments at which H of a sensor jumped, by the stamps of its readings and in seconds after "
+        "the drive's first: H after less before, uT; H of the file is that of the end"
+    ),
     "stated": (
         "errors whose standard deviations were stated: ratio of what the readings show to what was "
         "stated; gain: twice the logarithm by which the readings are more likely so"
@@ -136,13 +140,13 @@ MODEL = {
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
 ABOUT_ERRORS = (
-    *("uncertainty", "doubts", "notes", "exact", "disturbances", "stated", "pose_duration"),
-    "unseen_warp_m",
+    *("uncertainty", "doubts", "notes", "exact", "disturbances", "jumps", "stated"),
+    *("pose_duration", "unseen_warp_m"),
 )
 ABOUT_ORIGIN = ("recorded", "map_origin", "traces", "versions", "iterations")
 """Fields of a result as the file has them, in its order."""
 OPTIONAL = (
-    *("notes", "exact", "disturbances", "stated", "pose_duration", "unseen_warp_m"),
+    *("notes", "exact", "disturbances", "jumps", "stated", "pose_duration", "unseen_warp_m"),
     *("traces", "sources", "metrics_sha256", "recorded", "map_origin"),
 )
 SENSOR_KEYS = (

@@ -17,6 +17,7 @@ from l2m_gtsam.calibration.changed_places import ChangesOptions, is_place_of, su
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.drive_sources import DriveSources, drive_sources
 from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.offset_jumps import FoundJumps, jumps_of
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings, joined_rows
 from l2m_gtsam.maps.sources.found_sources import FoundSources, price, refined
@@ -24,14 +25,13 @@ from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.qa.metrics.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.validation import EXPECTED_TIMES
+from l2m_gtsam.records.error_budget import OffsetJump
 from l2m_gtsam.records.places import CLEAR, ChangedSource, WhatChanged
 from l2m_gtsam.records.validation import (
     CalibrationPart,
     NotValidated,
-    OffsetJump,
     ValidatedSensor,
 )
-from l2m_gtsam.validation.jumps import FoundJumps, jumps_of
 
 TIE = "The readings do not show which"
 Parts = tuple[CalibrationPart, ...]

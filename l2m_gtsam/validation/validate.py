@@ -7,6 +7,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.calibrate import prepare
 from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.offset_jumps import ANYTHING_UT, without_jump
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers, places_of
 from l2m_gtsam.data import (
@@ -28,12 +29,12 @@ from l2m_gtsam.recording.drive_trace import is_of
 from l2m_gtsam.recording.saturation import saturation_sentence
 from l2m_gtsam.recording.sync import stuck_sensors
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.error_budget import OffsetJump
 from l2m_gtsam.records.validation import (
     CalibrationPart,
     Displacement,
     DriveValidation,
     NotValidated,
-    OffsetJump,
     ValidatedSensor,
 )
 from l2m_gtsam.solve.correction import without_moving
@@ -41,7 +42,6 @@ from l2m_gtsam.validation.displacement import OF_PLACE, SensorsOnDrive, common_d
 from l2m_gtsam.validation.exchange import TestedSensor, exchanged
 from l2m_gtsam.validation.figures import Thinning, doubts_and_notes, offset_s, sensor_figures
 from l2m_gtsam.validation.innovation import KnownCalibration, estimate_of
-from l2m_gtsam.validation.jumps import ANYTHING_UT, without_jump
 from l2m_gtsam.validation.places import (
     PlaceOrVehicle,
     SuspectedDrive,

@@ -21,7 +21,7 @@ from l2m_gtsam.qa.verdict.sensor import (
     saturation,
     unconverged,
 )
-from l2m_gtsam.qa.verdict.uncertainty import disturbance_reasons, stated_wrongly
+from l2m_gtsam.qa.verdict.uncertainty import disturbance_reasons, jump_reasons, stated_wrongly
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     Disagreement,
@@ -176,7 +176,8 @@ def _left_open(case: Case) -> bool:
 
 def _own_disturbances(case: Case) -> list[Reason]:
     """Return what disturbed this sensor alone."""
-    return disturbance_reasons(case.result, case.sensor.sensor)
+    sensor = case.sensor.sensor
+    return [*jump_reasons(case.result, sensor), *disturbance_reasons(case.result, sensor)]
 
 
 def _stated(case: Case) -> list[Reason]:

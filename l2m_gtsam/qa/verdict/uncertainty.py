@@ -1,6 +1,7 @@
 """Where the uncertainty of a calibration comes from: shares of causes, and disturbances."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -10,11 +11,13 @@ from l2m_gtsam.records.error_budget import (
     DisturbanceKind,
     DurationSource,
     ErrorCause,
+    OffsetJump,
     PoseDuration,
     StatedSize,
     VarianceShare,
 )
 from l2m_gtsam.records.verdict import Level, Reason
+from l2m_gtsam.text import significant, with_sigma
 
 NAMES = {
     ErrorCause.NOISE: "noise",
@@ -27,7 +30,7 @@ NAMES = {
     ErrorCause.CLOCK: "a clock that drifts",
     ErrorCause.SMOOTHING: "smoothed readings",
     ErrorCause.MOVING_PARTS: "parts that move",
-    ErrorCause.CURRENTS: "recorded numbers",
+    ErrorCause.CURRENTS: "recorded numbers, jumps of H",
     ErrorCause.PRIORS: "priors",
     ErrorCause.UNMODELLED: "not modelled",
 }
@@ -42,10 +45,11 @@ REMEDIES = {
     ErrorCause.CLOCK: "one clock for readings and poses",
     ErrorCause.SMOOTHING: "readings without a low-pass filter",
     ErrorCause.MOVING_PARTS: "recorded steering and currents (`bag.regressors`)",
-    ErrorCause.CURRENTS: "a drive on which the recorded numbers change more",
+    ErrorCause.CURRENTS: "a drive on which recorded numbers change more, and H does not jump",
     ErrorCause.PRIORS: "a drive that determines what now comes from priors",
     ErrorCause.UNMODELLED: "stated errors of poses and of the survey's sensors",
 }
+OF_THE_END = "H is stated as at the end of the drive: calibrate again where that does not last."
 LISTED = 0.01  # of a variance
 
 
@@ -166,6 +170,23 @@ def disturbance_reasons(result: CalibrationResult, sensor: str | None) -> list[R
         level = Level.WARN if matters else Level.PASS
         reasons.append(Reason(level, disturbance_sentence(found)))
     return reasons
+
+
+def jump_reasons(result: CalibrationResult, sensor: str) -> list[Reason]:
+    """Return the jumps of H of a sensor: which H a vehicle has from now on is not known."""
+    own = [each for each in result.jumps if each.sensor == sensor]
+    return [Reason(Level.WARN, f"{jump_sentence(each)} {OF_THE_END}") for each in own]
+
+
+def jump_sentence(jump: OffsetJump) -> str:
+    """Return when H jumped and by how much."""
+    size = significant(float(np.linalg.norm(jump.change)), 2)
+    parts = ", ".join(map(with_sigma, jump.change, jump.sigma))
+    drive = f" of {Path(jump.bag).name}" if jump.bag else ""
+    return (
+        f"{jump.seconds:.0f} s after the start{drive} its offset H jumped by {size} µT: ({parts}) "
+        "µT along its x, y, z: something magnetic was laid near it, taken away or switched."
+    )
 
 
 def _missed(found: Disturbance, result: CalibrationResult) -> float:

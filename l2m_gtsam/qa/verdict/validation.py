@@ -1,6 +1,6 @@
 """The verdict on a calibration that was tested on another drive, or beside an older one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -8,6 +8,8 @@ from l2m_gtsam.qa.metrics.changes import change_of
 from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions, thresholds
 from l2m_gtsam.qa.verdict.places import source_reasons
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, beyond_range, outside_map
+from l2m_gtsam.qa.verdict.uncertainty import jump_sentence
+from l2m_gtsam.records.error_budget import MOST_JUMPS
 from l2m_gtsam.records.validation import (
     CalibrationChange,
     CalibrationComparison,
@@ -17,14 +19,12 @@ from l2m_gtsam.records.validation import (
     Displacement,
     DriveValidation,
     NotValidated,
-    OffsetJump,
     ValidatedSensor,
 )
 from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict, worst
 from l2m_gtsam.text import in_unit, significant, with_sigma
 
 SHARED_LIMITS = ("unexplained", "rejected", "outside_map", "saturated")
-WANDERS = 3  # jumps of H of one sensor are no jumps
 EXPECTED_TIMES = 2.0  # a refit that leaves no more than this of what is expected fits the map
 NAMES = {
     CalibrationPart.PLACE: "its place t",
@@ -188,25 +188,19 @@ def _exchanged(sensor: ValidatedSensor) -> list[Reason]:
 
 def _jumped(drive: DriveValidation, sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     """Return the jumps of its H during the drive; many of them are one that wanders."""
-    own = [each for each in drive.jumps if each.sensor == sensor.sensor]
-    if len(own) < WANDERS:
-        return [_of_jump((each,), f"{each.seconds:.0f} s after the start", options) for each in own]
-    return [_of_jump(own, f"From {own[0].seconds:.0f} to {own[-1].seconds:.0f} s", options)]
-
-
-def _of_jump(jumps: Sequence[OffsetJump], when: str, options: QaOptions) -> Reason:
-    """Return one jump, or all together of a sensor whose H wanders."""
-    change = np.sum([each.change for each in jumps], axis=0)
-    sigma = np.linalg.norm([each.sigma for each in jumps], axis=0)
+    own, limit = [e for e in drive.jumps if e.sensor == sensor.sensor], options.validation.offset_ut
+    if len(own) < MOST_JUMPS:
+        sizes = [float(np.linalg.norm(each.change)) for each in own]
+        return [Reason(limit.level(s), jump_sentence(e)) for s, e in zip(sizes, own, strict=True)]
+    change = np.sum([each.change for each in own], axis=0)
+    sigma = np.linalg.norm([each.sigma for each in own], axis=0)
     whole = change_of(CalibrationPart.OFFSET, change, sigma, 0.0)
     text = (
-        f"{when} its offset H jumped by {by_how_much(whole)}: something magnetic was laid near it, "
-        "taken away or switched."
-        if len(jumps) == 1
-        else f"{when} after the start its offset H wanders, by {by_how_much(whole)} in all: the "
-        "sensor warms up, or something moves near it. Other changes of it may be of that."
+        f"From {own[0].seconds:.0f} to {own[-1].seconds:.0f} s after the start its offset H "
+        f"wanders, by {by_how_much(whole)} in all: the sensor warms up, or something moves near "
+        "it. Other changes of it may be of that."
     )
-    return Reason(options.validation.offset_ut.level(whole.size), text)
+    return [Reason(limit.level(whole.size), text)]
 
 
 def _misfit(sensor: ValidatedSensor, options: QaOptions) -> bool:

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import (
+    BoolArray,
     FieldSeries,
     FloatArray,
     KnownSensor,
@@ -47,6 +48,10 @@ def troubled_drive(
             bent_scale = not_linear(options, readings.field[rows], rng)
             change[rows] += bent_scale
             truth[index] = linear_over(truth[index], readings.field[rows], bent_scale)
+        if trouble.has(Trouble.JUMP):
+            jump, before = jumped(options, seed, index, len(seconds))
+            change[rows] += np.where(before[:, None], 0.0, jump)
+            truth[index] = with_offset(truth[index], jump)
         moment = np.random.default_rng([seed, 13, index]).integers(len(walked))
         truth[index] = with_offset(truth[index], walked[moment])
     trajectory = drive.trajectory
@@ -113,6 +118,16 @@ def steered(options: TroublesOptions, readings: Readings, rng: np.random.Generat
     angle = np.clip(turning / options.steering_rad_s, -1.0, 1.0)
     field = options.steering_ut / np.sqrt(3) * rng.standard_normal(3)
     return np.asarray(angle[:, None] * field)
+
+
+def jumped(
+    options: TroublesOptions, seed: int, index: int, count: int
+) -> tuple[FloatArray, BoolArray]:
+    """Return by how much H of a sensor jumps, uT, shape (3,), and which readings are before."""
+    at = np.random.default_rng([seed, 14]).uniform(*options.jump_at)
+    direction = np.random.default_rng([seed, 15, index]).standard_normal(3)
+    jump = options.jump_ut * direction / np.linalg.norm(direction)
+    return jump, np.arange(count) < at * count
 
 
 def with_offset(sensor: KnownSensor, change: FloatArray) -> KnownSensor:

@@ -35,6 +35,8 @@ class Trouble(StrEnum):
     """The sensors have low-pass filters."""
     STEERING = "steering"
     """Iron near the sensors moves with the steering."""
+    JUMP = "jump"
+    """H of all sensors jumps at one moment of the drive."""
     ALL = "all"
     """All that is not stated, together."""
 
@@ -105,6 +107,10 @@ class TroublesOptions(Options):
     length."""
     steering_rad_s: float = Field(default=0.5, gt=0)
     """Rate of turn at which the steering is at its stop."""
+    jump_ut: float = Field(default=2.0, gt=0)
+    """Length of a jump of H in uT, of each sensor in a direction of its own."""
+    jump_at: tuple[float, float] = (0.2, 0.8)
+    """When: between these shares of a drive, for all sensors at once."""
     map: MapOptions = MapOptions()
     """How the map is made of the survey, and of the structure that the LiDAR saw."""
 

@@ -12,8 +12,9 @@ from l2m_gtsam.data import KnownSensor
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.records.error_budget import Disturbance, DisturbanceKind
 from l2m_gtsam.records.verdict import Level, Verdict
+from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble
-from tests.drives.troubled import OPTIONS, drifting_clock, drive, hall
+from tests.drives.troubled import DRIVE, OPTIONS, drifting_clock, drive, hall
 
 # Of 15 parameters of two sensors under one map; 1 of 1,000 each where sigmas are true.
 WITHIN = float(chi2.ppf(0.999, 15))
@@ -150,3 +151,30 @@ def test_iron_that_steers_is_found_and_held() -> None:
     assert max(distances(found, truth)) < WITHIN
     assert verdict.level is Level.WARN
     assert said_of(verdict, "mag_00", "H of mag_00 follows how the vehicle")
+
+
+def test_a_jump_of_H_is_timed_sized_and_taken_off() -> None:
+    found, truth, verdict = drive(Trouble.JUMP)
+    recording, _ = troubled_drive(OPTIONS, hall(Trouble.CLEAN), Trouble.JUMP, DRIVE)
+    clean, _ = troubled_drive(OPTIONS, hall(Trouble.CLEAN), Trouble.CLEAN, DRIVE)
+    jumps = {each.sensor: each for each in found.result.jumps}
+    assert set(jumps) == {"mag_00", "mag_01"}
+    for jumped, before in zip(recording.series, clean.series, strict=True):
+        change = jumped.field - before.field
+        jump = jumps[jumped.sensor]
+        # Of three axes 0.1 % lie beyond four sigmas.
+        assert np.abs(jump.change - change[-1]).max() < 4 * max(jump.sigma)
+        first = jumped.stamp_ns[np.flatnonzero(change.any(axis=1))[0]]
+        # Averages are of half a second.
+        assert abs(jump.stamp_ns - first) < 1e9
+    # Nothing has to stand in for it: neither a walk of H nor steel.
+    assert not shown(Trouble.JUMP, DisturbanceKind.WANDER)
+    assert found.result.sources == ()
+    assert max(distances(found, truth)) < WITHIN
+    assert verdict.level is Level.WARN
+    assert said_of(verdict, "mag_00", "after the start its offset H jumped by 2.0 µT")
+
+
+def test_an_H_that_walks_does_not_jump() -> None:
+    assert drive(Trouble.DRIFT)[0].result.jumps == ()
+    assert drive(Trouble.PINK)[0].result.jumps == ()

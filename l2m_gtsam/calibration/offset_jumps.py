@@ -15,14 +15,11 @@ from l2m_gtsam.calibration.causes import sensor_offsets
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.maps.sources.found_sources import price
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.qa.verdict.validation import WANDERS
-from l2m_gtsam.records.validation import OffsetJump
+from l2m_gtsam.records.error_budget import MOST_JUMPS, OffsetJump
 
 AXES = 3
 MOMENTS = 40  # at which one is tried at once
 FEWEST = 5  # averages of the sensor before it, and after
-MOST = WANDERS  # of a sensor: one that jumps so often does not jump
 ANYTHING_UT = 100.0  # standard deviation of a jump before readings
 
 
@@ -78,8 +75,8 @@ class FoundJumps:
                 sensor=readings.sensors[jump.sensor],
                 stamp_ns=jump.stamp_ns,
                 seconds=1e-9 * (jump.stamp_ns - start),
-                change=row(change),
-                sigma=row(spread),
+                change=tuple(change.tolist()),
+                sigma=tuple(spread.tolist()),
             )
             for jump, change, spread in zip(
                 self.each, self.change.reshape(-1, AXES), sigma, strict=True
@@ -96,12 +93,13 @@ def jumps_of(rows: MarginalRows, drive: AveragedDrive) -> FoundJumps:
     rows, drive
         The averaged readings, N of them, their sensors free.
     """
-    offsets = sensor_offsets(drive)
+    present, each = np.unique(drive.view.readings.sensor).tolist(), sensor_offsets(drive)
+    offsets = dict(zip(present, np.split(each, len(present), axis=2), strict=True))
     found: list[FoundJump] = []
     least, beside = price(rows, AXES + 1), rows
     while True:
-        few = [s for s in range(offsets.shape[2] // AXES) if count(found, s) < MOST]
-        tried = [_best(beside, drive, offsets, sensor) for sensor in few]
+        few = [(s, own) for s, own in offsets.items() if count(found, s) < MOST_JUMPS]
+        tried = [_best(beside, drive, own, sensor) for sensor, own in few]
         gain, jump = max(tried, key=lambda each: each[0], default=(0.0, None))
         if jump is None or gain < least:
             break
@@ -116,14 +114,13 @@ def count(found: Sequence[FoundJump], sensor: int) -> int:
 
 
 def _best(
-    rows: MarginalRows, drive: AveragedDrive, offsets: FloatArray, sensor: int
+    rows: MarginalRows, drive: AveragedDrive, own: FloatArray, sensor: int
 ) -> tuple[float, FoundJump | None]:
     """Return the jump of a sensor that explains most: at some moments, then between two."""
     stamps = np.sort(drive.view.readings.stamp_ns[drive.view.readings.sensor == sensor])
     stamps = stamps[FEWEST : -FEWEST or None]
     if not len(stamps):
         return 0.0, None
-    own = offsets[:, :, AXES * sensor : AXES * (sensor + 1)]
     at = np.arange(len(stamps))
     while True:
         few = at[np.unique(np.linspace(0, len(at) - 1, MOMENTS).astype(int))]
