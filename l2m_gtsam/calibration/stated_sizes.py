@@ -5,7 +5,7 @@ are then larger or smaller than their prior has them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -96,6 +96,22 @@ def leave_noise(stated: Sequence[StatedSize], noise: FloatArray) -> bool:
     """
     too_large = any(each.is_wrong and each.ratio < 1 for each in stated)
     return not (too_large and take_all_noise(noise))
+
+
+def noise_is_short(stated: Sequence[StatedSize]) -> bool:
+    """Return whether noise was stated so small that all that is found would be noise."""
+    return any(e.cause is ErrorCause.NOISE and e.is_wrong and e.ratio > 1 for e in stated)
+
+
+def beside_processes(
+    stated: Sequence[StatedSize], sensors: Sequence[str], left: FloatArray
+) -> tuple[StatedSize, ...]:
+    """Return sizes with the noise that processes leave, as shares of what readings showed, (S,)."""
+    share = dict(zip(sensors, left.tolist(), strict=True))
+    return tuple(
+        replace(each, ratio=each.ratio * share[each.sensor]) if each.sensor else each
+        for each in stated
+    )
 
 
 def take_all_noise(noise: FloatArray) -> bool:

@@ -30,7 +30,7 @@ from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver, Optimised
 from l2m_gtsam.calibration.parts_alone import ByParts
 from l2m_gtsam.calibration.sensor_columns import SENSOR
-from l2m_gtsam.calibration.stated_sizes import leave_noise
+from l2m_gtsam.calibration.stated_sizes import beside_processes, leave_noise, noise_is_short
 from l2m_gtsam.calibration.uncertain_graph import (
     ROUND_SIGMAS,
     THERE_SIGMAS,
@@ -123,6 +123,11 @@ def solve_uncertain(
     found = settle_by_any(drive, near, tests, options, lambda done: progress(SEARCHED * done))
     # Processes would take up what is stated too small: it is judged without them.
     stated = found.optimum.stated(options.sensor_noise_ut)
+    if short := noise_is_short(stated):
+        # White readings would be several times what they should, and anything would explain them.
+        options = options.model_copy(update={"sensor_noise_ut": None})
+        near = replace(found.estimate, noise=found.optimum.noise())
+        found = settle_by_any(drive, near, tests, options, lambda _: None)
     searched = found.ending is not Ending.SINGULAR
     searched = searched and leave_noise(stated, found.estimate.noise[view.sensors])
     known = found.optimum.informed() if searched else None
@@ -138,6 +143,9 @@ def solve_uncertain(
             lambda done: progress(SEARCHED + (1 - SEARCHED) * done),
             start.begin,
         )
+    if short:
+        left = found.estimate.noise / near.noise
+        stated = beside_processes(stated, view.readings.sensors, left)
     optimum = found.optimum
     solved, size = optimum.by_cause(optimum.solutions()), None
     if known is not None and options.warp_m > 0 and found.drive.budget.warp is None:

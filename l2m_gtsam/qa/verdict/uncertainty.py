@@ -96,9 +96,10 @@ def _wrong(found: StatedSize, lasting: PoseDuration | None) -> str:
             f"an error of its own), or correct them ({where})."
         )
     if found.ratio > 1:
+        counts = "which counts" if found.cause is ErrorCause.NOISE else "and sigmas are too small"
         return (
-            f"The {what} are too small: the readings show {found.ratio:.1f} times as much, and "
-            f"sigmas are too small. Correct them ({where})."
+            f"The {what} are too small: the readings show {found.ratio:.1f} times as much, "
+            f"{counts}. Correct them ({where})."
         )
     return (
         f"The {what} are too large: the readings show {found.ratio:.2f} times as much, and sigmas "
