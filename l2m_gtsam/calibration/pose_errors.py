@@ -14,6 +14,7 @@ Then the variables are the means of u over the segments, which are as good as in
 """
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -41,11 +42,14 @@ class PoseKnots:
     spacing
         Time between each knot and the next in seconds, infinite from one drive to the next, shape
         (K - 1,).
+    of_each_pose
+        Whether errors are mostly each pose's own: variables say next to nothing of single ones.
     """
 
     seconds: FloatArray
     correlation_s: float
     spacing: FloatArray
+    of_each_pose: ClassVar[bool] = False
 
     @staticmethod
     def over(
@@ -132,6 +136,8 @@ class SegmentMeans(PoseKnots):
     What one mean has in common with the next is next to nothing; within a segment the covariance is
     exact.
     """
+
+    of_each_pose = True
 
     @property
     def correlation(self) -> FloatArray:

@@ -45,7 +45,7 @@ from l2m_gtsam.parallel.threads import side_by_side
 from l2m_gtsam.records.error_budget import DisturbanceKind, StatedSize
 from l2m_gtsam.solve.rank import Determinacy, RankOptions
 
-MAX_ROUNDS = 6
+MAX_ROUNDS = 10
 # Where places are open errors of the map stand in for them, and steps overshoot.
 ROUNDS_OF_OPEN = 20
 SEARCHED = 0.6  # of the way, when it is known which processes a drive has

@@ -307,11 +307,15 @@ class UncertainProblem:
     def at_likely_poses(self, values: gtsam.Values) -> Readings:
         """Return the drive's readings where their poses are likely, which knots say in part.
 
-        They are as measured where poses are exact, or errors of a stated size take the place of all
-        noise: then these are too large, and what they would correct is noise.
+        They are as measured where poses are exact; where errors last, which are variables: a
+        correction by what knots leave of them is quadratic in residuals that hang together, and
+        scatters more than it mends; and where errors of a stated size take the place of all noise:
+        then these are too large, and what they would correct is noise.
         """
         readings, pose, estimate = self.drive.view.readings, self.noise.pose, self.estimate
-        if pose is None or take_all_noise(estimate.noise[self.drive.view.sensors]):
+        if pose is None or not pose.knots.of_each_pose:
+            return readings
+        if take_all_noise(estimate.noise[self.drive.view.sensors]):
             return readings
         errors, residual = np.empty((len(readings), POSE)), self.residual(values)
         groups = self.drive.prior.coverage.groups

@@ -67,6 +67,6 @@ def test_noise_stated_too_small_is_no_process_and_counts_as_the_readings_show_it
     result, without = calibration(1 / 3, ErrorCause.NOISE), calibration(1.0, ErrorCause.NOISE)
     assert result.disturbances == ()
     for each, right in zip(result.sensors, without.sensors, strict=True):
-        # Noise of 1,200 values is known to 2 %; a start with another weight ends a trifle elsewhere.
+        # Noise of 1,200 values is known to 2 %; from other weights the solve ends a trifle off.
         assert each.noise == pytest.approx(OPTIONS.noise, rel=0.1)
         assert each.t_sigma == pytest.approx(right.t_sigma, rel=0.1)
