@@ -11,10 +11,10 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.solve.closed_form import left_by_any
+from l2m_gtsam.solve.noise import is_chance
 
 AXES = 3
 LIMIT = float(quantile(0.999, AXES))  # of what a place explains of noise, so many are below
-ALIKE_SIGMAS = 4.0  # of a correlation of n values, which by chance is 1 / sqrt(n)
 
 
 def shows_no_place(readings: Readings, field_map: QueryableMap, t: FloatArray) -> bool:
@@ -48,4 +48,4 @@ def shows_no_place(readings: Readings, field_map: QueryableMap, t: FloatArray) -
 def is_noise(left: FloatArray) -> bool:
     """Return whether neighbours are no more alike than chance makes them, shape (N, 3)."""
     alike = np.sum(left[1:] * left[:-1]) / np.sum(left**2)
-    return bool(alike < ALIKE_SIGMAS / np.sqrt(left.size))
+    return is_chance(float(alike), left.size)

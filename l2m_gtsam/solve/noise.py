@@ -11,12 +11,18 @@ from l2m_gtsam.records.calibration import ResidualFigures
 # to above the Earth's field.
 NOISE_RANGE = (1e-4, 1e3)
 LEAST_LEFT = 0.5  # of a residual's variance by a fit
+CHANCE_SIGMAS = 4.0  # of a correlation of N values, which by chance is 1 / sqrt(N)
 HALF = 0.5  # a reading of no more weight has no part in the estimate of the noise
 
 
 def rms(values: FloatArray) -> float:
     """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
+
+
+def is_chance(correlation: float, values: int) -> bool:
+    """Return whether a correlation of so many values is no more than chance makes it."""
+    return bool(correlation < CHANCE_SIGMAS / np.sqrt(values))
 
 
 def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatArray) -> FloatArray:

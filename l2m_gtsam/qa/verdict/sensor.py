@@ -16,6 +16,7 @@ from l2m_gtsam.records.calibration import (
 )
 from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Level, Reason
+from l2m_gtsam.solve.noise import is_chance
 from l2m_gtsam.text import by_sigma, sigma_alone, significant
 
 OPEN_HEAD = "Not everything can be known"
@@ -28,7 +29,6 @@ HEADS = {
     SensorStatus.FLIPPED_AXIS: "An axis is reversed",
 }
 WORSE = 1.5  # of what a uniform field leaves of the readings: the map contradicts them
-CHANCE_SIGMAS = 4.0  # of a correlation of N readings, which by chance is 1 / sqrt(N)
 WRONG_MAP = (
     "The map does not fit this drive: a field that is the same everywhere explains the readings as "
     "well. Is it the map of this place, and are the poses in its frame?"
@@ -166,8 +166,11 @@ def _explained(case: Case) -> list[Reason]:
         return []
     found = case.metrics.fit
     # Where the place is open, the field is too uniform to test the map, unless that is worse. So
-    # it is where what the map leaves is noise, from one reading to the next.
-    even = not np.isfinite(case.sensor.t_sigma).all() or _leaves_noise(case.metrics)
+    # it is where what the map leaves is noise, from one reading to the next: of a map that is
+    # wrong neighbours have much the same left.
+    even = not np.isfinite(case.sensor.t_sigma).all() or is_chance(
+        case.metrics.autocorrelation.next, case.metrics.fit.readings
+    )
     if even and not found.unexplained > WORSE:
         return []
     text = (
@@ -182,14 +185,6 @@ def _explained(case: Case) -> list[Reason]:
     else:
         text += "it explains less than a map of this place should."
     return case.options.unexplained.reasons(found.unexplained, text)
-
-
-def _leaves_noise(metrics: SensorMetrics) -> bool:
-    """Return whether what is left of neighbouring readings is no more alike than chance makes it.
-
-    Of a map that is wrong neighbours have much the same left.
-    """
-    return bool(metrics.autocorrelation.next < CHANCE_SIGMAS / np.sqrt(metrics.fit.readings))
 
 
 def _consistent(case: Case) -> list[Reason]:
