@@ -163,23 +163,6 @@ class Tiling:
         graph = coo_array((np.ones(len(touching)), tuple(touching.T)), shape=(len(cells),) * 2)
         return int(connected_components(graph, directed=False)[0])
 
-    def shares(self, points: FloatArray, tile: int | IntArray) -> FloatArray:
-        """Return the weight of a tile at points, before all tiles' weights are normalised.
-
-        Parameters
-        ----------
-        points
-            Metres, shape (N, 3).
-        tile
-            Index of the tile, or of one for each point, shape (N,).
-        """
-        away = np.abs(points[:, :2] - self.grid.centres[tile]) - 0.5 * self.grid.size
-        ramp = np.clip(0.5 - 0.5 * away / self.blend, 0.0, 1.0)
-        smooth = (
-            ramp * ramp * ramp * (10 + ramp * (6 * ramp - 15))
-        )  # twice differentiable at both ends
-        return np.asarray(smooth[:, 0] * smooth[:, 1])
-
     def by_tile(self, points: FloatArray) -> list[TilePoints]:
         """Return which tiles have a share in which points; far from all of them the nearest has.
 

