@@ -30,6 +30,7 @@ from l2m_gtsam.records.metrics import (
     Repeatability,
     SensorMetrics,
 )
+from l2m_gtsam.solve.explain import movement
 
 DRAWN = 6000  # readings of all sensors together, so that a report stays small
 FEWEST, MOST = 100, 500  # of each
@@ -223,17 +224,15 @@ def drive_metrics(recording: Recording) -> DriveMetrics:
     """Return how the vehicle moved, in all drives of a recording together."""
     drives = [each.trajectory for each in recording.parts]
     p, R = (np.concatenate(each) for each in ([d.p for d in drives], [d.R for d in drives]))
-    up = R[:, :, 2]
-    mean = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
-    tilt = np.arccos(np.clip(up @ mean, -1, 1))
+    moved = movement(R, p)
     heading = np.arctan2(R[:, 1, 0], R[:, 0, 0])
     sector = np.floor(np.rad2deg(heading) % 360 / HEADING_DEG)
     return DriveMetrics(
         path=rows(_path(drives), 3),
         seconds=float(sum(1e-9 * (d.stamp_ns[-1] - d.stamp_ns[0]) for d in drives)),
         length=float(sum(np.linalg.norm(np.diff(d.p, axis=0), axis=1).sum() for d in drives)),
-        heave=float(np.ptp(p[:, 2])),
-        tilt_deg=float(np.rad2deg(tilt.max())),
+        heave=moved.heights,
+        tilt_deg=moved.tilt,
         heading=float(len(np.unique(sector)) / (360 / HEADING_DEG)),
     )
 
