@@ -15,7 +15,7 @@ from l2m_gtsam.calibration.budget.found import Budget
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
 from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover, errors_over_stated
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
-from l2m_gtsam.calibration.pose_errors import pose_features
+from l2m_gtsam.calibration.pose_errors import error_of_poses
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
@@ -277,11 +277,8 @@ def pose_shares(
         covariance = covariance + root @ root.transpose(0, 2, 1)
     values, axes = np.linalg.eigh(covariance)
     roots = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    R, t = readings.R_map_lidar, estimate.t[readings.sensor]
-    field, gradient = field_map.field_and_gradient(places_of(readings, estimate.t))
-    R_lidar_map = R.transpose(0, 2, 1)
-    b = np.einsum("nij,nj->ni", R_lidar_map, field)
-    return np.asarray(R @ pose_features(roots, b, R_lidar_map @ gradient @ R, t))
+    F = error_of_poses(replace(readings, pose_root=roots), field_map, estimate)
+    return np.asarray(readings.R_map_lidar @ F)
 
 
 def nuisances(
