@@ -89,7 +89,7 @@ def _synchronise_one(
     finite = np.asarray(np.isfinite(series.field).all(axis=1))
     repeated = _repeated(series.stamp_ns, finite)
     spanned = _spanned(trajectory.stamp_ns, series.stamp_ns, around_ns)
-    gap = _longest_gap_ns(trajectory.stamp_ns, series.stamp_ns, around_ns)
+    gap = longest_gap_ns(trajectory.stamp_ns, series.stamp_ns, around_ns)
     near = gap <= options.max_pose_gap_s * 1e9
     fresh = finite & ~repeated
     keep = fresh & spanned & near
@@ -146,7 +146,7 @@ def _spanned(pose_ns: IntArray, stamp_ns: IntArray, around_ns: int) -> BoolArray
     return np.asarray((stamp_ns >= first) & (stamp_ns <= last))
 
 
-def _longest_gap_ns(pose_ns: IntArray, stamp_ns: IntArray, around_ns: int) -> IntArray:
+def longest_gap_ns(pose_ns: IntArray, stamp_ns: IntArray, around_ns: int = 0) -> IntArray:
     """Return the longest time between two poses around each reading, 0 on a pose."""
     if len(pose_ns) < 2:
         return np.zeros(len(stamp_ns), dtype=np.int64)
@@ -209,7 +209,7 @@ def at_poses(readings: Readings, trajectory: Trajectory, offset: FloatArray) -> 
 def has_pose(trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float) -> BoolArray:
     """Return which times lie between two poses that are not further apart, shape (N,)."""
     spanned = _spanned(trajectory.stamp_ns, stamp_ns, 0)
-    return spanned & (_longest_gap_ns(trajectory.stamp_ns, stamp_ns, 0) <= max_pose_gap_s * 1e9)
+    return spanned & (longest_gap_ns(trajectory.stamp_ns, stamp_ns) <= max_pose_gap_s * 1e9)
 
 
 def interpolated(trajectory: Trajectory, stamp_ns: IntArray) -> Trajectory:

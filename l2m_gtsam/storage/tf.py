@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.errors import BagError
+from l2m_gtsam.recording.sync import longest_gap_ns
 
 
 @dataclass(frozen=True)
@@ -95,20 +96,13 @@ def compose(
     fastest = max(moving, key=lambda link: len(link.stamp_ns)).stamp_ns
     stamps = fastest[(fastest >= start) & (fastest <= end)]
     for link in moving:
-        stamps = stamps[_bracket_ns(link.stamp_ns, stamps) <= max_gap_s * 1e9]
+        stamps = stamps[longest_gap_ns(link.stamp_ns, stamps) <= max_gap_s * 1e9]
     R, p = np.broadcast_to(np.eye(3), (len(stamps), 3, 3)), np.zeros((len(stamps), 3))
     for link in chain:
         step = link.at(stamps)
         p = p + np.einsum("nij,nj->ni", R, step.p)
         R = R @ step.R
     return Trajectory(stamps, R, p, frame, child_frame)
-
-
-def _bracket_ns(link_ns: IntArray, stamps: IntArray) -> IntArray:
-    """Return the time between the two transforms around each stamp, 0 on a transform."""
-    after = np.searchsorted(link_ns, stamps)
-    before = np.searchsorted(link_ns, stamps, side="right") - 1
-    return np.asarray(link_ns[after] - link_ns[before])
 
 
 def chain_frames(links: Iterable[tuple[str, str]], ends: tuple[str, str]) -> set[str]:
