@@ -2,17 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import BagError
-from l2m_gtsam.options import Options
 from l2m_gtsam.progress import Count
-from l2m_gtsam.records.scans import Scan, taken_at_once
+from l2m_gtsam.records.scans import Scan, ScanOptions, taken_at_once
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import VoxelMeans, located
 from l2m_gtsam.storage.log import Message
@@ -22,24 +21,16 @@ from l2m_gtsam.storage.point_table import MAX_POINTS
 from l2m_gtsam.storage.tf import Link
 
 
-class CloudTopicOptions(Options):
+class CloudTopicOptions(ScanOptions):
     """How the scans of a topic become one cloud."""
 
     edge: float = Field(default=0.1, ge=0.01)
     """Scans are merged in cells of this size in metres, one point each."""
-    min_range: float = Field(default=0.5, ge=0)
-    """Nearer points are dropped, metres from the lidar: they are the vehicle itself."""
     max_range: float = Field(default=20.0, gt=0, le=1000)
     """Further points are dropped, metres from the lidar: they are out of reach of the sensors,
     and the errors of the poses' rotations grow with the distance."""
     max_pose_gap_s: float = Field(default=0.5, gt=0)
     """Scans between two poses further apart than this are skipped."""
-
-    @model_validator(mode="after")
-    def _leave_room(self) -> Self:
-        if self.min_range >= self.max_range:
-            raise ValueError("`min_range` must be less than `max_range`")
-        return self
 
 
 @dataclass(frozen=True)
