@@ -31,7 +31,7 @@ from l2m_gtsam.qa.verdict.mounting import check_names
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics
-from l2m_gtsam.records.verdict import Judgement, Level, Verdict
+from l2m_gtsam.records.verdict import Judgement, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.files import atomic_path, source_file, write_text
 from l2m_gtsam.storage.record_files import read_metrics, read_slam, record_id, write_slam
@@ -47,11 +47,6 @@ class Reported:
 
     judgement: Judgement
     report_id: str
-
-    @property
-    def level(self) -> Level:
-        """The verdict of the whole."""
-        return self.judgement.level
 
 
 def report_localisation(folder: Path, config: Path | None, page: Path) -> Reported:

@@ -134,7 +134,7 @@ def check_report(out: Path, folder: Path) -> None:
     strict = folder / "strict.yaml"
     strict.write_text("qa: {slam: {position_sigma_m: {warn: 1.0e-6, fail: 2.0e-6}}}")
     with no_pages():
-        assert report_folder(out, strict).level is Level.FAIL
+        assert report_folder(out, strict).judgement.level is Level.FAIL
     (out / "metrics.json").write_text("{}")
     assert "holds a calibration (metrics.json) and a localisation" in complaint_here("report", out)
     (out / "metrics.json").unlink()

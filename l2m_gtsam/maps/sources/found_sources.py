@@ -88,7 +88,7 @@ def refined(rows: MarginalRows, shapes: tuple[SourceShape, ...]) -> FoundSources
     theta = np.concatenate([each.vector for each in shapes])
     prior = SourcePrior.of(len(shapes), float(np.median(rows.points[:, 2])), free)
     state = _State.at(rows, theta, free, prior)
-    lengths = np.tile(~_is_moment(), len(shapes))[free]
+    lengths = np.tile(~_is_in(MOMENT), len(shapes))[free]
     damping = 1e-3
     for _ in range(STEPS):
         F = state.information + damping * np.diag(np.diag(state.information))
@@ -198,18 +198,12 @@ class _State:
 
 def _free(shape: SourceShape) -> BoolArray:
     """Return which parameters of a source are open: a dipole has no length, a bar a direction."""
-    return np.asarray(~_is_half_axis() | (shape.vector != 0))
+    return np.asarray(~_is_in(HALF_AXIS) | (shape.vector != 0))
 
 
-def _is_half_axis() -> BoolArray:
+def _is_in(part: slice) -> BoolArray:
     mask = np.zeros(PARAMETERS, dtype=np.bool_)
-    mask[HALF_AXIS] = True
-    return mask
-
-
-def _is_moment() -> BoolArray:
-    mask = np.zeros(PARAMETERS, dtype=np.bool_)
-    mask[MOMENT] = True
+    mask[part] = True
     return mask
 
 

@@ -63,7 +63,7 @@ def steps() -> list[tuple[str, float]]:
 @pytest.fixture(scope="module")
 def reported(made: Made, steps: list[tuple[str, float]]) -> tuple[Level, str]:
     """The verdict and the page, made from the files."""
-    level = report_folder(made.folder, None, lambda *how_far: steps.append(how_far)).level
+    level = report_folder(made.folder, None, lambda *how_far: steps.append(how_far)).judgement.level
     return level, (made.folder / REPORT_FILE).read_text()
 
 
@@ -161,7 +161,7 @@ def test_thresholds_come_from_the_configuration(
     assert reported[0] is Level.WARN
     strict = tmp_path / "strict.yaml"
     strict.write_text("qa: {position_sigma_m: {warn: 1.0e-6, fail: 1.0e-5}}\n")
-    assert report_folder(made.folder, strict).level is Level.FAIL
+    assert report_folder(made.folder, strict).judgement.level is Level.FAIL
     assert "1e-05" in (made.folder / REPORT_FILE).read_text()
 
 
