@@ -6,7 +6,7 @@ from importlib.metadata import version
 import numpy as np
 
 from l2m_gtsam.calibration.budget.found import Budget
-from l2m_gtsam.calibration.changed_places import solve_changed
+from l2m_gtsam.calibration.changed_places import ChangedSolve, solve_changed
 from l2m_gtsam.calibration.coverage import KnowsSurvey
 from l2m_gtsam.calibration.explanation import explained
 from l2m_gtsam.calibration.jumping_solve import solve_jumping
@@ -135,23 +135,36 @@ def calibrated(
         # Steel that the search did not know of makes one place look like another.
         found = _starts(alive, changed.taken_into(compiled), options, priors, progress)
     outcome, solver_map = changed.outcome, changed.solver_map
-    solution = outcome.solution
-    field_map = changed.taken_into(field_map)
+    solved_map = changed.taken_into(field_map)
     drive = SolvedDrive(
         synchronised=synchronised,
         readings=alive,
         outcome=outcome,
-        explained=explained(outcome.readings, solver_map, t_start, solution, options.solve),
+        explained=explained(outcome.readings, solver_map, t_start, outcome.solution, options.solve),
         starts=tuple(found),
         moved=movement(recording.trajectory.R, recording.trajectory.p),
     )
+    result = _result(recording, drive, changed, solved_map, options, map_source)
+    return Calibrated(result, outcome.solution, solved_map, solver_map)
+
+
+def _result(
+    recording: Recording,
+    drive: SolvedDrive,
+    changed: ChangedSolve,
+    field_map: QueryableMap,
+    options: CalibrationOptions,
+    map_source: SourceFile | None,
+) -> CalibrationResult:
+    """Return the record of a solved drive; a CalibrationError if no sensor is solved."""
+    solution, readings = drive.outcome.solution, drive.readings
     sensors = sensor_verdicts(drive, options)
     if not solution.solved:
         covered = covers(field_map, recording.trajectory)
         raise CalibrationError(_nothing_solved(recording, map_source, sensors, covered))
-    stretches = _rejected_stretches(solution, solver_map, options)
-    result = CalibrationResult(
-        sensors=tuple(_with_missing(each, alive, recording) for each in sensors),
+    stretches = _rejected_stretches(solution, changed.solver_map, options)
+    return CalibrationResult(
+        sensors=tuple(_with_missing(each, readings, recording) for each in sensors),
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
         doubts=(
@@ -166,8 +179,8 @@ def calibrated(
         bags=tuple(drive.source for drive in recording.drives),
         notes=tuple(n for drive in recording.parts for n in (*drive.notes, *drive.origins)),
         traces=tuple(trace_of(drive.trajectory) for drive in recording.parts),
-        exact=taken_for_exact(alive, field_map, solution.budget),
-        disturbances=solution.budget.named(alive.sensors),
+        exact=taken_for_exact(readings, field_map, solution.budget),
+        disturbances=solution.budget.named(readings.sensors),
         stated=solution.stated,
         pose_duration=solution.pose_duration,
         unseen_warp_m=solution.unseen_warp_m,
@@ -175,7 +188,6 @@ def calibrated(
         jumps=tuple(_jump_in_own_time(each, recording) for each in jumping.jumps),
         recorded=tuple(map(_recorded, recording.parts)),
     )
-    return Calibrated(result, solution, field_map, solver_map)
 
 
 def prepare(recording: Recording, options: CalibrationOptions) -> Synchronised:
