@@ -28,7 +28,8 @@ from l2m_gtsam.qa.metrics.repeatability import (
     no_halves,
 )
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.records.metrics import Halves, Measures, Metrics, Repeatability
+from l2m_gtsam.records.metrics import Measures, Metrics
+from l2m_gtsam.records.repeatability import Halves, Repeatability
 
 FIGURES = "figures"
 """Stage of the figures of a calibration and its picture."""

@@ -6,7 +6,7 @@ The hash of a file says nothing once a drive was copied, cut, reindexed or conve
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
-from l2m_gtsam.records.calibration import DriveTrace
+from l2m_gtsam.records.provenance import DriveTrace
 
 # Of a trace: about a kilobyte, and still several in a tenth of a drive that was cut out.
 POSES = 40

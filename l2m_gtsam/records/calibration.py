@@ -3,15 +3,12 @@
 Frames and units are those of ``data``.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from types import GenericAlias
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, GetCoreSchemaHandler
-from pydantic_core import CoreSchema, core_schema
+from pydantic import Field
 
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
 from l2m_gtsam.records.by_sensor import BySensor
@@ -25,64 +22,13 @@ from l2m_gtsam.records.error_budget import (
     VarianceShare,
 )
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource, clear_cause
-from l2m_gtsam.records.provenance import MapOrigin, RecordedDrive
-from l2m_gtsam.records.record import Record
+from l2m_gtsam.records.provenance import DriveTrace, MapOrigin, RecordedDrive
+from l2m_gtsam.records.record import KeyedBy
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.verdict import Judgement
 
-
-@dataclass(frozen=True)
-class DriveTrace(Record):
-    """Some poses of a drive, spread evenly over it.
-
-    Attributes
-    ----------
-    stamp_ns
-        Times in nanoseconds, strictly increasing, shape (N,).
-    p
-        Positions of the lidar in the map in metres, shape (N, 3).
-    """
-
-    stamp_ns: tuple[int, ...]
-    p: tuple[tuple[float, ...], ...]
-
-
 Row15 = Annotated[list[float], Field(min_length=15, max_length=15)]
 Rows16 = Annotated[list[list[float]], Field(min_length=16, max_length=16)]
-
-
-@dataclass(frozen=True)
-class KeyedBy:
-    """How pydantic reads and writes a tuple of records: as a mapping from one of their fields."""
-
-    name: str
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        entries_type = GenericAlias(dict, (str, get_args(source)[0]))
-        entries = core_schema.no_info_before_validator_function(
-            self._with_names, handler.generate_schema(entries_type)
-        )
-        return core_schema.no_info_after_validator_function(
-            lambda found: tuple(found.values()),
-            entries,
-            serialization=core_schema.wrap_serializer_function_ser_schema(
-                self._by_name, schema=handler.generate_schema(source)
-            ),
-        )
-
-    def _with_names(self, entries: Any) -> Any:
-        """Return entries with their names inside; what is no mapping is refused afterwards."""
-        if not isinstance(entries, dict):
-            return entries
-        return {
-            name: {**entry, self.name: name} if isinstance(entry, dict) else entry
-            for name, entry in entries.items()
-        }
-
-    def _by_name(self, records: Any, dump: Callable[[Any], list[dict[str, Any]]]) -> Any:
-        return {entry.pop(self.name): entry for entry in dump(records)}
 
 
 class SensorStatus(StrEnum):

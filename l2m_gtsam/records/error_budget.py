@@ -6,8 +6,7 @@ from enum import StrEnum
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.records.metrics import Row
-from l2m_gtsam.records.record import Record
+from l2m_gtsam.records.record import Record, Row
 
 
 class ErrorCause(StrEnum):

@@ -10,8 +10,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from l2m_gtsam.records.metrics import Row
-from l2m_gtsam.records.record import Record
+from l2m_gtsam.records.record import Record, Row
 from l2m_gtsam.text import significant
 
 VERDICTS = ("pass", "warn", "fail")

@@ -17,9 +17,9 @@ from l2m_gtsam.records.localisation import (
     SensorUse,
     StartFinding,
 )
-from l2m_gtsam.records.metrics import FitFigures, MapPicture, Normalised, Row, Rows, Series
+from l2m_gtsam.records.metrics import FitFigures, MapPicture, Normalised, Series
 from l2m_gtsam.records.provenance import NamedSource
-from l2m_gtsam.records.record import Record, Shape
+from l2m_gtsam.records.record import Record, Row, Rows, Shape
 from l2m_gtsam.records.validation import ChiSquare
 from l2m_gtsam.records.verdict import Judgement
 

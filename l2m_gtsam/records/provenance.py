@@ -42,6 +42,22 @@ class RecordedDrive(Record):
 
 
 @dataclass(frozen=True)
+class DriveTrace(Record):
+    """Some poses of a drive, spread evenly over it.
+
+    Attributes
+    ----------
+    stamp_ns
+        Times in nanoseconds, strictly increasing, shape (N,).
+    p
+        Positions of the lidar in the map in metres, shape (N, 3).
+    """
+
+    stamp_ns: tuple[int, ...]
+    p: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
 class MapOrigin(Record):
     """What a map was made from.
 

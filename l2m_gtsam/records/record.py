@@ -1,13 +1,18 @@
 """What all records that are files have in common: numbers as JSON has them, arrays that fit."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Any, ClassVar
+from types import GenericAlias
+from typing import Any, ClassVar, get_args
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import ConfigDict, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+Row = tuple[float, ...]
+Rows = tuple[Row, ...]
 
 # Squares and sums of such numbers are finite; no quantity is nearly as large in any unit.
 LARGEST = 1e30
@@ -91,3 +96,37 @@ class Record:
 def fields_of(record: Record, kind: type[Record]) -> dict[str, Any]:
     """Return the fields of a record that it has from one of its base classes, by name."""
     return {each.name: getattr(record, each.name) for each in fields(kind)}
+
+
+@dataclass(frozen=True)
+class KeyedBy:
+    """How pydantic reads and writes a tuple of records: as a mapping from one of their fields."""
+
+    name: str
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        entries_type = GenericAlias(dict, (str, get_args(source)[0]))
+        entries = core_schema.no_info_before_validator_function(
+            self._with_names, handler.generate_schema(entries_type)
+        )
+        return core_schema.no_info_after_validator_function(
+            lambda found: tuple(found.values()),
+            entries,
+            serialization=core_schema.wrap_serializer_function_ser_schema(
+                self._by_name, schema=handler.generate_schema(source)
+            ),
+        )
+
+    def _with_names(self, entries: Any) -> Any:
+        """Return entries with their names inside; what is no mapping is refused afterwards."""
+        if not isinstance(entries, dict):
+            return entries
+        return {
+            name: {**entry, self.name: name} if isinstance(entry, dict) else entry
+            for name, entry in entries.items()
+        }
+
+    def _by_name(self, records: Any, dump: Callable[[Any], list[dict[str, Any]]]) -> Any:
+        return {entry.pop(self.name): entry for entry in dump(records)}

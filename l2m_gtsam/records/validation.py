@@ -12,10 +12,10 @@ from pydantic import AliasChoices, Field
 
 from l2m_gtsam.data import SaturatedAxis
 from l2m_gtsam.records.error_budget import OffsetJump
-from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Row, Series
+from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Series
 from l2m_gtsam.records.places import ChangedSource, WhatChanged
 from l2m_gtsam.records.provenance import NamedSource
-from l2m_gtsam.records.record import Record
+from l2m_gtsam.records.record import Record, Row
 from l2m_gtsam.records.verdict import Threshold, Verdict
 
 

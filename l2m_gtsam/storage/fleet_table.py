@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from l2m_gtsam.records.fleet import DATE, FleetRow, SensorRow
-from l2m_gtsam.records.metrics import Row
+from l2m_gtsam.records.record import Row
 from l2m_gtsam.storage.files import atomic_path
 
 MISSING = "fleet.parquet needs pyarrow, fleet.csv has the same: pip install 'l2m-gtsam[fleet]'"

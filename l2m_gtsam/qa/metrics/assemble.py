@@ -21,15 +21,8 @@ from l2m_gtsam.qa.metrics.mounting import mounting
 from l2m_gtsam.qa.metrics.plain import evenly, row, rows
 from l2m_gtsam.qa.metrics.repeatability import NOT_DONE, SEVERAL, no_halves
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
-from l2m_gtsam.records.metrics import (
-    Directions,
-    DriveMetrics,
-    Halves,
-    MapPicture,
-    Measures,
-    Repeatability,
-    SensorMetrics,
-)
+from l2m_gtsam.records.metrics import Directions, DriveMetrics, MapPicture, Measures, SensorMetrics
+from l2m_gtsam.records.repeatability import Halves, Repeatability
 from l2m_gtsam.solve.explain import movement
 
 DRAWN = 6000  # readings of all sensors together, so that a report stays small

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from l2m_gtsam.data import IntArray
-from l2m_gtsam.records.metrics import Row, Rows
+from l2m_gtsam.records.record import Row, Rows
 
 
 def row(values: ArrayLike, digits: int = 6) -> Row:

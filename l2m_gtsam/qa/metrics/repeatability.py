@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.calibration.half_difference import HalfDifference
 from l2m_gtsam.data import BoolArray, Distortion, FloatArray, IntArray
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.records.metrics import DriveRepeat, GroupDistance, Halves, Repeatability
+from l2m_gtsam.records.repeatability import DriveRepeat, GroupDistance, Halves, Repeatability
 from l2m_gtsam.solve.chi_square import quantile
 
 TINY = 1e-12  # relative to the largest, of variances in units of useful sigmas

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, SourceFile
 from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.svg import as_svg
-from l2m_gtsam.records.metrics import Row
+from l2m_gtsam.records.record import Row
 from l2m_gtsam.storage.report_id import SHOWN
 from l2m_gtsam.text import (
     by_sigma,

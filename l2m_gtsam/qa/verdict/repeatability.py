@@ -7,13 +7,8 @@ from pathlib import Path
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.sensor import Case
 from l2m_gtsam.records.calibration import SensorStatus
-from l2m_gtsam.records.metrics import (
-    DriveRepeat,
-    GroupDistance,
-    Halves,
-    Repeatability,
-    SensorMetrics,
-)
+from l2m_gtsam.records.metrics import SensorMetrics
+from l2m_gtsam.records.repeatability import DriveRepeat, GroupDistance, Halves, Repeatability
 from l2m_gtsam.records.verdict import Level, Reason
 from l2m_gtsam.solve.chi_square import quantile
 

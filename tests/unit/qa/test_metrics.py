@@ -18,7 +18,7 @@ from l2m_gtsam.qa.metrics.plain import evenly
 from l2m_gtsam.qa.metrics.repeatability import PartialEstimate, compare_halves, no_halves
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.repeatability import furthest, furthest_shown, halves_agree
-from l2m_gtsam.records.metrics import Halves
+from l2m_gtsam.records.repeatability import Halves
 from l2m_gtsam.storage.record_files import read_metrics
 
 SEEDS = st.integers(0, 10_000)

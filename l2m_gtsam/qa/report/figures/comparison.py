@@ -22,7 +22,7 @@ from l2m_gtsam.qa.report.svg import (
     short_name,
 )
 from l2m_gtsam.records.calibration import SensorCalibration
-from l2m_gtsam.records.metrics import Repeatability
+from l2m_gtsam.records.repeatability import Repeatability
 from l2m_gtsam.records.validation import ValidatedSensor
 from l2m_gtsam.text import with_sigma
 

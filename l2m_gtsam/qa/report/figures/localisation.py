@@ -33,7 +33,8 @@ from l2m_gtsam.qa.report.svg import (
     short_name,
 )
 from l2m_gtsam.records.localisation_file import SensorRecord, TruthRecord
-from l2m_gtsam.records.metrics import MapPicture, Rows
+from l2m_gtsam.records.metrics import MapPicture
+from l2m_gtsam.records.record import Rows
 
 DRAWN = 1500  # poses of a line, at most
 ELLIPSES = 12

@@ -34,8 +34,9 @@ from l2m_gtsam.qa.report.figures.map_changes import draw_changes, list_changes
 from l2m_gtsam.qa.report.hover import axes_image, places, some_and_marked
 from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
 from l2m_gtsam.records.calibration import Disagreement
-from l2m_gtsam.records.metrics import MapPicture, Metrics, Row, Rows, Series
+from l2m_gtsam.records.metrics import MapPicture, Metrics, Series
 from l2m_gtsam.records.places import ChangedSource
+from l2m_gtsam.records.record import Row, Rows
 
 # Of colour bars: a drive is wider than high more often than not.
 CELLS = 240  # along the longer side of a map

@@ -21,7 +21,8 @@ from l2m_gtsam.qa.report.drawing import (
 from l2m_gtsam.qa.report.hover import cells, strips
 from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, PAPER, SMALL, X, Y
 from l2m_gtsam.records.calibration import SensorCalibration
-from l2m_gtsam.records.metrics import Normalised, Row, SensorMetrics
+from l2m_gtsam.records.metrics import Normalised, SensorMetrics
+from l2m_gtsam.records.record import Row
 from l2m_gtsam.solve.chi_square import density
 from l2m_gtsam.text import with_sigma
 
