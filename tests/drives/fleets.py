@@ -9,6 +9,7 @@ import numpy as np
 from l2m_gtsam.batch.maps import build_map_file
 from l2m_gtsam.config import load_config
 from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
+from l2m_gtsam.progress import silent
 from l2m_gtsam.simulate.bag_writer import BagKind, write_bag
 from tests.drives.degenerate import STRONG, eight, mounted
 from tests.drives.verdict import read
@@ -52,7 +53,7 @@ def make_place(folder: Path) -> Place:
     ideal = KnownSensor.ideal("suite")
     bag = folder / "survey.bag"
     write(bag, survey, (ideal,), seed=1)
-    build_map_file([bag], folder / "map.npz", load_config(config), None, lambda *_: None)
+    build_map_file([bag], folder / "map.npz", load_config(config), None, silent)
     return Place(folder / "map.npz", config)
 
 

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 
 from l2m_gtsam.data import Recording, SourceFile
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.slam.localisation import Localisation, localise
@@ -37,7 +38,7 @@ def driven() -> tuple[SlamDrive, CalibrationResult]:
 
 def found(recording: Recording, known: CalibrationResult) -> Localisation:
     """Return a drive localised, its calibration refined."""
-    done = localise(recording, WORLD, known, OPTIONS, lambda stage, share: None)
+    done = localise(recording, WORLD, known, OPTIONS, silent)
     result = replace(
         done.result,
         map=SourceFile("map.npz", "cd" * 32),

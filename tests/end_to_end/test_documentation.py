@@ -15,6 +15,7 @@ import l2m_gtsam
 from l2m_gtsam.api.results import JudgedCalibration
 from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.config import load_options
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
@@ -130,7 +131,7 @@ def more_readings(folder: Path) -> None:
     options = folder / "hall.yaml"
     options.write_text(yaml.text)
     wanted = load_options(options, ScenarioOptions).model_copy(update={"survey_seed": 2})
-    simulate_bags(path, wanted, [BagKind.ROS1], lambda stage, share: None)
+    simulate_bags(path, wanted, [BagKind.ROS1], silent)
     shutil.move(path / "mapping_ros1.bag", folder / "more.bag")
 
 

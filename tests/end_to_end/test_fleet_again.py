@@ -22,6 +22,7 @@ from l2m_gtsam.batch.fleet_task import (
 from l2m_gtsam.batch.reports import OUTCOME_FILE
 from l2m_gtsam.errors import NoRoomError
 from l2m_gtsam.parallel.cluster import ClusterOptions
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.fleet import DriveOutcome
 from tests.drives.fleet_runs import FleetRun, table
 from tests.drives.fleets import not_a_bag, vehicle
@@ -145,7 +146,7 @@ def test_only_what_is_missing_or_changed_is_computed(
 
     monkeypatch.setattr(batch_fleet, "computed", count)
     spoil(there)
-    fleet = run_fleet(there.order, ClusterOptions(workers=1), lambda *_: None)
+    fleet = run_fleet(there.order, ClusterOptions(workers=1), silent)
     named = {f"{each.drive.vehicle}/{each.drive.bag.name}" for each in asked}
     everything = {f"{row['vehicle']}/{row['bag']}" for row in table(fleet_run.out)}
     assert named == (everything if again is None else again)
@@ -185,10 +186,10 @@ def test_a_full_disk_is_no_row(
             no_pages(),
             pytest.raises(NoRoomError, match=r"day_0: .* No space left on device; make room"),
         ):
-            run_fleet(there.order, ClusterOptions(workers=1), lambda *_: None)
+            run_fleet(there.order, ClusterOptions(workers=1), silent)
     assert contents(there.out) == before
     with no_pages():
-        fleet = run_fleet(there.order, ClusterOptions(workers=1), lambda *_: None)
+        fleet = run_fleet(there.order, ClusterOptions(workers=1), silent)
     assert fleet.computed == 1
     assert contents(there.out).keys() == before.keys()
     assert contents(there.out) != before

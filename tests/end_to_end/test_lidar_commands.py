@@ -11,6 +11,7 @@ from l2m_gtsam.batch.files import SavedMap
 from l2m_gtsam.batch.scan_poses import read_drive_on, read_drive_or_follow
 from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.config import Config, load_config
+from l2m_gtsam.progress import silent
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
@@ -58,7 +59,7 @@ class Scanned:
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
     folder = tmp_path_factory.mktemp("scanned")
     options = ScenarioOptions.model_validate(HALL)
-    scenario = simulate_bags(folder, options, [BagKind.ROS1], lambda stage, share: None)
+    scenario = simulate_bags(folder, options, [BagKind.ROS1], silent)
     harmonic = QUICK_HARMONIC | {"hyperparameters": PRIOR}
     start = scenario.calibration.recording.trajectory.p[0] + [0.3, -0.2, 0.1]
     mapping = {"model": {"harmonic": harmonic}}
@@ -90,7 +91,7 @@ def test_poses_of_a_drive_come_from_its_clouds(hall: Scanned, tmp_path: Path) ->
     """Errors of millimetres, no larger than their sigmas say."""
     saved, config = SavedMap.read(hall.map), load_config(hall.config)
     drive = begin(hall.drive, tmp_path / "begin.bag", seconds=SOME)
-    found = read_drive_on(saved, drive, config, lambda stage, share: None)
+    found = read_drive_on(saved, drive, config, silent)
     assert "poses are those of its point clouds" in found.notes[0]
     trajectory = found.trajectory
     assert trajectory.frame == "map"
@@ -105,7 +106,7 @@ def test_poses_of_a_drive_come_from_its_clouds(hall: Scanned, tmp_path: Path) ->
 
 def test_where_there_is_no_map_clouds_give_odometry(hall: Scanned, tmp_path: Path) -> None:
     short = begin(hall.drive, tmp_path / "b.bag", seconds=6.0)
-    found = read_drive_or_follow(short, Config(), lambda stage, share: None)
+    found = read_drive_or_follow(short, Config(), silent)
     assert "odometry by its point clouds" in found.notes[0]
     assert (found.trajectory.frame, len(found.series)) == ("odom", 1)
     true = hall.scenario.calibration.motion.at(found.trajectory.stamp_ns)

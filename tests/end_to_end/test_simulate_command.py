@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.progress import silent
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.storage.bag import read_trajectory
@@ -71,7 +72,7 @@ def test_another_run_without_drift_leaves_no_truth_of_the_one_before(tmp_path: P
     out.mkdir()
     (out / "ground_truth.tum").write_text("of the run before")
     plain = ScenarioOptions.model_validate({**CORRIDOR, "odometry": None, "lidar": None})
-    simulate_bags(out, plain, [BagKind.MCAP], lambda stage, share: None)
+    simulate_bags(out, plain, [BagKind.MCAP], silent)
     assert not (out / "ground_truth.tum").exists()
     topics = {each.topic for each in inspect_bag(out / "calibration_mcap", BagOptions()).topics}
     assert topics == {"/odometry", "/mag_00"}

@@ -10,6 +10,7 @@ import pytest
 
 from l2m_gtsam.batch.validation import ValidationRequest, validate_calibration
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
@@ -132,10 +133,6 @@ def test_a_change_since_an_older_calibration(calibration: Path, tmp_path: Path) 
     told = "\n".join(found.verdict.lines(Level.PASS))
     assert "Since the old calibration its place t has changed by 300 mm" in told
     assert "verdict: FAIL" in told
-
-
-def silent(stage: str, fraction: float) -> None:
-    """Show no progress."""
 
 
 def test_bad_input(

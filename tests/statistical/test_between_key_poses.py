@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
@@ -60,7 +61,7 @@ def errors(
 def solved(seed: int, sensors: int, every: int) -> tuple[Errors, Errors]:
     """Return errors of all poses solved together, and of those found on line."""
     drawn, world = drive(seed, sensors, every), dipole_world(seed)
-    batch = localise_drive(drawn.drive, world, SlamOptions(), lambda _stage, _share: None)
+    batch = localise_drive(drawn.drive, world, SlamOptions(), silent)
     beliefs = followed_beliefs(drawn.drive, world, RobustOptions(), free=False)
     covariance = np.stack([each.pose_covariance for each in beliefs])
     poses, each = [belief.pose for belief in beliefs], EVERY // every

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
@@ -71,7 +72,7 @@ def one_drive(seed: int) -> Outcome:
         last.sensors,
         last.calibration_covariance,
     )
-    solved = localise_drive(drawn.drive, world, REFINED, lambda _stage, _share: None)
+    solved = localise_drive(drawn.drive, world, REFINED, silent)
     covariance = solved.calibration_covariance
     batch = nees_of(drawn, solved.poses, solved.pose_covariance, solved.drive.sensors, covariance)
     sigma = np.sqrt(np.einsum("sii->si", covariance))

@@ -9,6 +9,7 @@ from l2m_gtsam.batch.maps import build_map_file
 from l2m_gtsam.batch.simulation import STRUCTURE_FILE, SUITE_FILE, simulate_bags
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.progress import silent
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
@@ -26,10 +27,6 @@ SMALL = ScenarioOptions(
     calibration_sampling=SamplingOptions(field_rate=1.0),
 )
 CONFIG = Config.model_validate({"mapping": {"model": {"harmonic": QUICK_HARMONIC}}})
-
-
-def silent(stage: str, fraction: float) -> None:
-    """Report nothing."""
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_factors import KeyPoseReadings, KeyPoseResiduals, Whitening, key_pose_residuals
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
+from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.odometry import odometry_steps
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.pose_graph import pose_values
@@ -139,8 +140,8 @@ def test_key_poses_far_apart_know_what_key_poses_at_every_reading_do() -> None:
     """
     far, near = drive(4), drive(1)
     options = SlamOptions(robust=RobustOptions(confidence=1 - 1e-9))
-    rough = localise_drive(far.drive, WORLD, options, lambda _stage, _share: None)
-    exact = localise_drive(near.drive, WORLD, options, lambda _stage, _share: None)
+    rough = localise_drive(far.drive, WORLD, options, silent)
+    exact = localise_drive(near.drive, WORLD, options, silent)
     np.testing.assert_array_equal(far.p, near.p[::4])
     sigmas = np.sqrt(np.einsum("kii->ki", exact.pose_covariance[::4]))
     apart = [
