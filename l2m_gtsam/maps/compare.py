@@ -26,16 +26,13 @@ from scipy.optimize import minimize_scalar
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.errors import L2MError, MapError
-from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
+from l2m_gtsam.maps.build import KINDS, MapOptions
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.folds import Fold, FoldOptions, fitting_fold, folds_of, patches_of
 from l2m_gtsam.maps.training import TrainingSet, training_set
-from l2m_gtsam.options import Options
 from l2m_gtsam.solve.noise import rms
 
 COMPARED = tuple(kind for kind in KINDS if kind != "dense_gp")  # that one only checks another
-LARGEST_FOLD, LEAST_FOLD, SMALLER = 1.5, 0.1, 0.8  # metres, and the step between
-PATCHES_IN_FOLD = 4  # fewer, and the luck of the deal decides
-ASIDE = 0.1  # of the training readings, which determine the noise
 LEAST_NOISE = 1e-3  # uT, finer than magnetometers resolve: no map may claim to be exact
 Z_95 = 1.959964  # of a Gaussian, 95 % lie within as many standard deviations
 
@@ -43,24 +40,14 @@ Build = Callable[[FloatArray, FloatArray, str], FieldMap]
 """Returns a map from positions (N, 3) in metres, readings (N, 3) in uT and the name of a kind."""
 
 
-class CompareOptions(Options):
+class CompareOptions(FoldOptions):
     """How kinds of maps are compared."""
 
     kinds: tuple[str, ...] = Field(default=COMPARED, min_length=1)
     """Names of the kinds."""
 
-    fold: float | None = Field(default=None, ge=LEAST_FOLD)
-    """Edge of a patch in metres: the size of the gaps that the maps have to bridge. If not given,
-    1.5, made smaller by fifths until the readings fill four patches per fold, not below 0.1."""
-
-    folds: int = Field(default=4, ge=2, le=20)
-    """Groups that the patches are dealt out to; as many maps of each kind are built."""
-
     most: int = Field(default=20_000, ge=100)
     """The most readings that are used, taken evenly from all."""
-
-    seed: int = Field(default=0, ge=0)
-    """Seed of the dealing."""
 
     @field_validator("kinds")
     @classmethod
@@ -156,15 +143,6 @@ class MapComparison:
 
 
 @dataclass(frozen=True)
-class Fold:
-    """Rows of the readings that build a map, that determine the noise, and that judge it."""
-
-    training: IntArray
-    aside: IntArray
-    held_out: IntArray
-
-
-@dataclass(frozen=True)
 class Prediction:
     """Predictions of readings by maps, as errors.
 
@@ -195,16 +173,11 @@ class Prediction:
         return np.asarray(-0.5 * terms.sum(axis=1))
 
 
-def build_kind(points: FloatArray, field: FloatArray, kind: str) -> FieldMap:
-    """Return a map of a kind with its default options; see ``build_map``."""
-    return build_map(points, field, MapOptions(kind=kind))
-
-
 def compare_maps(
     points: FloatArray,
     field: FloatArray,
-    options: CompareOptions | None = None,
-    build: Build = build_kind,
+    options: CompareOptions,
+    build: Build,
 ) -> MapComparison:
     """Compare kinds of maps on held-out patches of the readings.
 
@@ -215,16 +188,15 @@ def compare_maps(
     field
         Readings in the map frame in microtesla, shape (N, 3).
     options
-        Defaults where absent.
+        Which kinds, and how readings are held out.
     build
-        Makes the maps; with the default options of each kind where absent.
+        Makes the maps.
 
     Raises
     ------
     MapError
         If no map can be made of such readings, or they fill too few patches.
     """
-    options = CompareOptions() if options is None else options
     readings = evenly(training_set(points, field), options.most)
     fold = fitting_fold(readings.points, options)
     patch = patches_of(readings.points, fold)
@@ -256,52 +228,6 @@ def evenly(readings: TrainingSet, most: int) -> TrainingSet:
     """Return at most so many readings, spread evenly over their order."""
     rows = np.linspace(0, len(readings) - 1, min(most, len(readings)))
     return readings[np.rint(rows).astype(np.int64)]
-
-
-def fitting_fold(points: FloatArray, options: CompareOptions) -> float:
-    """Return the edge of a patch in metres that is given, or that suits the points, (N, 3)."""
-    if options.fold is not None:
-        return options.fold
-    edges = [LARGEST_FOLD]
-    while edges[-1] > LEAST_FOLD / SMALLER:
-        edges.append(SMALLER * edges[-1])
-    wanted = PATCHES_IN_FOLD * options.folds
-    fills = (edge for edge in edges if int(patches_of(points, edge).max()) + 1 >= wanted)
-    return next(fills, edges[-1])
-
-
-def patches_of(points: FloatArray, edge: float) -> IntArray:
-    """Return the square patch of an edge in metres that each point lies in, shape (N,)."""
-    squares = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / edge)
-    _, patch = np.unique(squares, axis=0, return_inverse=True)
-    return np.asarray(patch, dtype=np.int64)
-
-
-def folds_of(patch: IntArray, options: CompareOptions) -> tuple[Fold, ...]:
-    """Return the folds that the patches are dealt out to; each holds about as many patches.
-
-    Raises
-    ------
-    MapError
-        If there are fewer patches than folds.
-    """
-    patches = int(patch.max()) + 1
-    if patches < options.folds:
-        raise MapError(
-            f"the readings fill {patches} patches, too few to compare maps in {options.folds} "
-            "folds; a longer drive or a smaller fold is needed"
-        )
-    rng = np.random.default_rng(options.seed)
-    group = (rng.permutation(patches) % options.folds)[patch]
-    return tuple(fold_without(group == index, rng) for index in range(options.folds))
-
-
-def fold_without(held_out: BoolArray, rng: np.random.Generator) -> Fold:
-    """Return the fold that holds out where the mask, shape (N,), is true."""
-    others = rng.permutation(np.flatnonzero(~held_out))
-    aside = int(np.ceil(ASIDE * len(others)))
-    # In their old order, for maps may depend on it to rounding.
-    return Fold(np.sort(others[aside:]), np.sort(others[:aside]), np.flatnonzero(held_out))
 
 
 def predicted(

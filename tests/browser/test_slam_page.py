@@ -7,6 +7,7 @@ import pytest
 
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.localisation_page import localisation_page
+from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.provenance import NamedSource
 from tests.drives.hostile import localisation
@@ -49,7 +50,7 @@ def hostile() -> LocalisationRecord:
 def looked(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Looked:
     folder: Path = tmp_path_factory.mktemp("localisation")
     page = folder / "report.html"
-    page.write_text(localisation_page(hostile(), QaOptions()), encoding="utf-8")
+    page.write_text(localisation_page(hostile(), QaOptions(), Identity("0" * 64)), encoding="utf-8")
     return look(browser, page)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from l2m_gtsam.qa.metrics.changes import compare_calibrations
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.qa.report.validation_page import validation_page
 from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
 from l2m_gtsam.records.calibration import CalibrationResult
@@ -55,7 +56,7 @@ def looked(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Looked:
     )
     folder: Path = tmp_path_factory.mktemp("validation")
     page = folder / "validation.html"
-    page.write_text(validation_page(found), encoding="utf-8")
+    page.write_text(validation_page(found, Identity("0" * 64)), encoding="utf-8")
     return look(browser, page)
 
 

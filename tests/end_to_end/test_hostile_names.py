@@ -22,6 +22,7 @@ from l2m_gtsam.qa.options import FleetOptions, QaOptions
 from l2m_gtsam.qa.report.figures.vehicle import calibration_figure
 from l2m_gtsam.qa.report.fleet_page import fleet_page
 from l2m_gtsam.qa.report.localisation_page import localisation_page
+from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.qa.report.svg import save_figure
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.files import folder_names, printable
@@ -219,8 +220,8 @@ def test_the_page_of_a_fleet() -> None:
 
 
 def test_the_page_of_a_localisation() -> None:
-    page = localisation_page(localisation(), QaOptions())
-    check_page(page, localisation_page(record(), QaOptions()))
+    page = localisation_page(localisation(), QaOptions(), Identity("0" * 64))
+    check_page(page, localisation_page(record(), QaOptions(), Identity("0" * 64)))
 
 
 @pytest.mark.study

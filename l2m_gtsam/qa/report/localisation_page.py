@@ -44,9 +44,7 @@ class LocalisationSection:
     pictures: dict[str, Picture]
 
 
-def localisation_page(
-    record: LocalisationRecord, options: QaOptions, identity: Identity | None = None
-) -> str:
+def localisation_page(record: LocalisationRecord, options: QaOptions, identity: Identity) -> str:
     """Return the report on a localisation as HTML.
 
     Text from bags is escaped; nothing is loaded from anywhere.
@@ -56,7 +54,7 @@ def localisation_page(
     options
         Thresholds of the verdict.
     identity
-        Of the file that it was written to; absent where it was not.
+        Of the file that it was written to.
     """
     verdict, path = judge_localisation(record, options), localised_trajectory(record)
     refined = {each.sensor: each for each in record.refined}

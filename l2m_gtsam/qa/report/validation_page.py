@@ -53,7 +53,7 @@ class ValidationSection:
     pictures: dict[str, Picture]
 
 
-def validation_page(found: Validation, identity: Identity | None = None) -> str:
+def validation_page(found: Validation, identity: Identity) -> str:
     """Return a validation as HTML.
 
     Text from bags is escaped; nothing is loaded from anywhere.
@@ -61,7 +61,7 @@ def validation_page(found: Validation, identity: Identity | None = None) -> str:
     Parameters
     ----------
     identity
-        Of the file that it was written to; absent where it was not.
+        Of the file that it was written to.
     """
     with mpl.rc_context(SETTINGS):
         return render(

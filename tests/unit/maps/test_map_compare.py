@@ -8,7 +8,7 @@ from rich.console import Console
 from l2m_gtsam.cli.tables.maps import comparison_table
 from l2m_gtsam.data import FieldSample, FloatArray, MapState
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.build import KINDS
+from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.compare import (
     LEAST_NOISE,
     CompareOptions,
@@ -18,13 +18,11 @@ from l2m_gtsam.maps.compare import (
     compare_maps,
     evenly,
     figures_of,
-    fitting_fold,
-    folds_of,
     noise_of,
-    patches_of,
     standard_error,
 )
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary, masked
+from l2m_gtsam.maps.folds import fitting_fold, folds_of, patches_of
 from l2m_gtsam.maps.training import training_set
 from tests.worlds.exact import dipole_world
 
@@ -79,12 +77,18 @@ def figures(comparison: MapComparison, kind: str) -> KindFigures:
     return found
 
 
+def built(points: FloatArray, field: FloatArray, kind: str) -> FieldMap:
+    return build_map(points, field, MapOptions(kind=kind))
+
+
 @pytest.fixture(scope="module")
 def dipoles() -> MapComparison:
     points = places()
     field, _ = dipole_world(1).field_and_gradient(points)
     noise = np.random.default_rng(3).normal(0, NOISE, field.shape)
-    return compare_maps(points, field + noise, CompareOptions(kinds=("sliding_gp", "bilinear")))
+    return compare_maps(
+        points, field + noise, CompareOptions(kinds=("sliding_gp", "bilinear")), built
+    )
 
 
 def test_the_sliding_process_is_preferred_to_the_grid(dipoles: MapComparison) -> None:
@@ -300,14 +304,14 @@ def test_patches_suit_the_area(size: tuple[float, float], expected: float) -> No
 
 def test_too_few_patches_are_refused_in_one_line() -> None:
     with pytest.raises(MapError, match=r"fill 1 patches, .* a smaller fold is needed"):
-        compare_maps(places(), noisy(), CompareOptions(fold=20))
+        compare_maps(places(), noisy(), CompareOptions(fold=20), built)
 
 
 def test_bad_readings_are_refused() -> None:
     spoiled = noisy()
     spoiled[7, 1] = np.nan
     with pytest.raises(MapError, match="training reading 7 of 4000 is not finite"):
-        compare_maps(places(), spoiled)
+        compare_maps(places(), spoiled, CompareOptions(), built)
 
 
 def test_unknown_kinds_are_refused_and_the_slow_reference_is_left_out() -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.localisation_page import localisation_page
+from l2m_gtsam.qa.report.page import Identity
 from l2m_gtsam.records.localisation_file import LocalisationRecord, SensorRecord, Timeline
 from tests.drives.localised import record
 
@@ -46,7 +47,7 @@ def unmapped() -> LocalisationRecord:
 
 @pytest.mark.parametrize("told", [parked, unmapped])
 def test_a_page_is_drawn(told: Callable[[], LocalisationRecord]) -> None:
-    page = localisation_page(told(), QaOptions())
+    page = localisation_page(told(), QaOptions(), Identity("0" * 64))
     assert page.count("<svg") >= 5
     assert ">None<" not in page
     assert ">nan<" not in page
@@ -60,7 +61,7 @@ def test_figures_of_a_page_are_those_of_the_record() -> None:
         drift=replace(told.drift, end_m=777.77, end_deg=666.6, largest_m=888.88),
         truth=replace(told.truth, nees=4.5678e6),
     )
-    one, two = (localisation_page(each, QaOptions()) for each in (told, other))
+    one, two = (localisation_page(each, QaOptions(), Identity("0" * 64)) for each in (told, other))
     for number in ("777.77", "666.6", "888.88", "4567800"):
         assert number not in one
         assert number in two
