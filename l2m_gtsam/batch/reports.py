@@ -1,9 +1,5 @@
-"""Reports on calibrations and localisations, as pages and, by a browser, as PDF."""
+"""Reports on calibrations and localisations."""
 
-import os
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,6 +14,7 @@ from l2m_gtsam.batch.drives import (
     EvaluatedCalibration,
 )
 from l2m_gtsam.batch.files import check_outputs, saved_options
+from l2m_gtsam.batch.printing import print_page
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import CalibrationError, ConfigError, OutputError
 from l2m_gtsam.options import first_fault
@@ -33,7 +30,7 @@ from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.verdict import Judgement, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
-from l2m_gtsam.storage.files import atomic_path, source_file, write_text
+from l2m_gtsam.storage.files import source_file, write_text
 from l2m_gtsam.storage.record_files import read_metrics, read_slam, record_id, write_slam
 from l2m_gtsam.storage.report_id import SHOWN
 from l2m_gtsam.storage.result_set import published
@@ -97,61 +94,6 @@ def write_slam_report(
     text = localisation_page(record, options, identity)
     with published(page.parent, page.name, adds=True) as stage:
         write_text(stage / page.name, text)
-
-
-BROWSERS = (
-    "chromium",
-    "chromium-browser",
-    "google-chrome",
-    "google-chrome-stable",
-    "microsoft-edge",
-)
-NAMED = "L2M_BROWSER"  # environment variable with another one
-TIMEOUT_S = 120
-
-
-def find_browser() -> str | None:
-    """Return the path of a browser that can print, if there is one."""
-    names = [os.environ.get(NAMED, ""), *BROWSERS]
-    return next((path for name in names if name and (path := shutil.which(name))), None)
-
-
-def print_page(page: Path, pdf: Path) -> None:
-    """Print a page to a PDF.
-
-    Raises
-    ------
-    OutputError
-        There is no browser, or it fails; the line says what to do.
-    """
-    browser = find_browser()
-    if browser is None:
-        raise OutputError(
-            f"{pdf}: a PDF is printed by Chromium, Chrome or Edge, and none was found: install "
-            f"chromium, name one in {NAMED}, or print {page.name} from any browser"
-        )
-    with tempfile.TemporaryDirectory() as profile, atomic_path(pdf) as temporary:
-        run = _run(browser, profile, page, temporary)
-        if run or not temporary.stat().st_size:
-            raise OutputError(
-                f"{pdf}: {browser} could not print {page.name}{run}; print it from any browser"
-            )
-
-
-def _run(browser: str, profile: str, page: Path, pdf: Path) -> str:
-    """Return what went wrong, as the end of a sentence."""
-    # As root, as in a container, there is no sandbox; the page is ours and has no script.
-    command = [
-        *(browser, "--headless", "--disable-gpu", "--no-sandbox", f"--user-data-dir={profile}"),
-        *("--no-pdf-header-footer", f"--print-to-pdf={pdf}", page.resolve().as_uri()),
-    ]
-    try:
-        run = subprocess.run(command, capture_output=True, check=False, timeout=TIMEOUT_S)  # noqa: S603
-    except subprocess.TimeoutExpired:
-        return f" within {TIMEOUT_S} s"
-    except OSError as error:
-        return f": {error.strerror}"
-    return f" (exit code {run.returncode})" if run.returncode else ""
 
 
 REPORT_FILE = "report.html"

@@ -5,7 +5,7 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
-from l2m_gtsam.batch.reports import find_browser
+from l2m_gtsam.batch.printing import find_browser
 from l2m_gtsam.qa.options import FleetOptions, QaOptions
 from l2m_gtsam.qa.report.calibration_page import calibration_page
 from l2m_gtsam.qa.report.fleet_page import fleet_page

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from l2m_gtsam.batch.reports import find_browser
+from l2m_gtsam.batch.printing import find_browser
 from l2m_gtsam.text import shown_lines
 from tests.drives.hostile import NAMES
 
