@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.support.browsing import find_tools
+from tests.support.browser_tools import find_tools
 from tests.support.repository import REPOSITORY
 
 # Machines are as fast as they are, and the first call of a compiled function compiles it.

@@ -13,7 +13,7 @@ from l2m_gtsam.records.fleet import Outlier
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.record_files import read_metrics
 from tests.drives.fleet_rows import row, sensor_row
-from tests.support.browsing import missing
+from tests.support.browser_tools import missing
 from tests.support.repository import REPOSITORY
 
 DESK = 1280  # pixels

@@ -3,19 +3,15 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-from l2m_gtsam.batch.printing import find_browser
 from l2m_gtsam.text import shown_lines
 from tests.drives.hostile import NAMES
+from tests.support.browser_tools import PROGRAMS
 
-PROGRAMS = Path(__file__).parents[1] / "browser"
 TIMEOUT_S = 280
 GRAVE = {"serious", "critical"}  # of axe-core
 SMALLEST_PX = 9.0  # text in figures; below it labels are not read on a phone
@@ -27,26 +23,6 @@ class Looked:
 
     looks: list[dict[str, Any]]
     tabbed: list[dict[str, Any]]
-
-
-def find_tools() -> str:
-    """Return the path of a browser; node and what `npm ci` installs are there, too."""
-    found = find_browser()
-    if found is None:
-        missing("no chromium: apt-get install chromium")
-    if shutil.which("node") is None:
-        missing("no node: apt-get install nodejs npm")
-    if not (PROGRAMS / "node_modules" / "puppeteer-core").is_dir():
-        missing("no puppeteer-core: run `npm ci` in tests/browser")
-    assert found is not None
-    return found
-
-
-def missing(reason: str) -> None:
-    """Skip, or fail where browsers are required."""
-    if os.environ.get("L2M_REQUIRE_BROWSER") == "1":
-        pytest.fail(reason)
-    pytest.skip(reason)
 
 
 def told_by(program: str, browser: str, *arguments: str | Path) -> dict[str, Any]:
