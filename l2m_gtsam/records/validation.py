@@ -109,9 +109,10 @@ class CalibrationChange(Record):
 
 @dataclass(frozen=True)
 class MinimumDetectableChange(Record):
-    """The smallest change of a part that surely shows: on a drive, all others as calibrated.
+    """The smallest change of a part that shows: on a drive, all others as calibrated.
 
-    Five standard deviations, in the units of ``CalibrationChange``; infinite where it shows none.
+    Its test misses it once in a hundred times, in its worst direction. In the units of
+    ``CalibrationChange``; infinite where it shows none.
     """
 
     part: CalibrationPart

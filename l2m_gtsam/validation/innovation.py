@@ -27,9 +27,10 @@ from l2m_gtsam.calibration.group_noise import group_noise
 from l2m_gtsam.calibration.pose_errors import pose_features
 from l2m_gtsam.calibration.view import QueryableMap, observe
 from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.qa.metrics.changes import MISSED
 from l2m_gtsam.qa.metrics.coordinates import COLUMNS, columns_of, width
 from l2m_gtsam.records.validation import CalibrationPart
-from l2m_gtsam.solve.chi_square import chance_beyond
+from l2m_gtsam.solve.chi_square import chance_beyond, noticed_sigmas
 
 ROWS = 4000  # that are reduced at once
 UNOBSERVABLE = 1e-9  # of the best observed direction of a part: zero but for rounding
@@ -319,8 +320,9 @@ def is_observable(likelihood: ChangeLikelihood, part: CalibrationPart) -> bool:
     return bool(np.linalg.norm(likelihood.root[:, COLUMNS[part]], axis=0).all())
 
 
-def detectable_change(likelihood: ChangeLikelihood, part: CalibrationPart, sigmas: float) -> float:
-    """Return the largest standard deviation of a part by itself, so many times; maybe infinite."""
+def detectable_change(likelihood: ChangeLikelihood, part: CalibrationPart, chance: float) -> float:
+    """Return the smallest change of a part by itself that `parts_changed` shows; maybe infinite."""
     own = likelihood.root[:, COLUMNS[part]]
     values = np.linalg.svd(own, compute_uv=False)
+    sigmas = noticed_sigmas(own.shape[1], chance / len(COLUMNS), MISSED)
     return float(sigmas / values[-1]) if values[-1] > UNOBSERVABLE * values[0] else float("inf")

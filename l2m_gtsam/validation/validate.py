@@ -350,7 +350,7 @@ def _tested(test: _Test, sensor: SensorCalibration) -> ValidatedSensor | NotVali
         return NotValidated(sensor.sensor, f"{beyond}{reason}", faulty=True)
     known, covariance = test.known(sensor), joint_covariance(sensor)
     found = recheck(drive, test.field_map, known, covariance, options.solve, test.chance)
-    figures = sensor_figures(drive, test.field_map, sensor, found, test.thinning)
+    figures = sensor_figures(drive, test.field_map, sensor, found, test.thinning, test.chance)
     return replace(figures, limits=limits, reads_as=test.reads_as.get(sensor.sensor, ""))
 
 
