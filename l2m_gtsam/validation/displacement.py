@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_factors import skew
 from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.coverage import errors_over_stated
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.qa.metrics.changes import MISSED
@@ -145,6 +146,8 @@ class SensorsOnDrive:
             self.known,
             self.options.pose_noise.lasting_s,
             lambda readings: np.concatenate([by.features(readings) for by in here], axis=2),
+            # What a map is wrong by beyond what it states is alike for all sensors.
+            errors_over_stated(self.field_map),
         )
         # Displacements are the last coordinates, behind those of the calibrations.
         free = FREEDOMS * len(here)
@@ -239,10 +242,13 @@ class DisplacementTest:
         Displacements by nothing.
     likelihood
         Of one of each, one after the other.
+    price
+        What each number of a displacement has to explain (the BIC).
     """
 
     starts: tuple[PoseDisplacement, ...]
     likelihood: ChangeLikelihood
+    price: float
 
     @classmethod
     def of(cls, sensors: SensorsOnDrive) -> "DisplacementTest":
@@ -256,29 +262,34 @@ class DisplacementTest:
             for of, at in middles.items()
             if of is Displaced.FRAME or len(sensors.known) > 1
         )
-        return cls(starts, sensors.likelihood(*starts))
+        count = sum(int(used.sum()) for used in sensors.usable())
+        return cls(starts, sensors.likelihood(*starts), float(np.log(3 * count)))
 
     def shown(self, chance: float) -> list[PoseDisplacement]:
-        """Return those that explain more than chance does."""
-        least = chance / (len(self.starts) * len(COLUMNS))
+        """Return those that explain more than chance does, and than they cost."""
         return [
             start
             for k, start in enumerate(self.starts)
             if any(
-                chance_beyond(self.likelihood.explained(at), len(at)) < least
+                chance_beyond(self.likelihood.explained(at), len(at)) < self._least(len(at), chance)
                 for at in self._columns(k)
             )
         ]
 
     def detectable(self, chance: float) -> tuple[DetectableShift, ...]:
         """Return the smallest shifts that are shown."""
-        sigmas = noticed_sigmas(len(SHIFT), chance / (len(self.starts) * len(COLUMNS)), MISSED)
+        sigmas = noticed_sigmas(len(SHIFT), self._least(len(SHIFT), chance), MISSED)
         found = []
         for k, start in enumerate(self.starts):
             shift, *_ = self._columns(k)
             least = float(np.linalg.svd(self.likelihood.root[:, shift], compute_uv=False)[-1])
             found.append(DetectableShift(start.of, sigmas / least if least > 0 else float("inf")))
         return tuple(found)
+
+    def _least(self, freedom: int, chance: float) -> float:
+        """Return how seldom chance has to do as much as a displacement with so many numbers."""
+        each = chance / (len(self.starts) * len(COLUMNS))  # Bonferroni
+        return min(each, float(chance_beyond(freedom * self.price, freedom)))
 
     def _columns(self, start: int) -> list[list[int]]:
         return [[FREEDOMS * start + k for k in at] for at in COLUMNS]

@@ -149,6 +149,7 @@ def change_likelihood(
     known: Sequence[KnownCalibration],
     correlation_s: float,
     displaced: Callable[[Readings], FloatArray] = held_poses,
+    map_errors: float = 1.0,
 ) -> ChangeLikelihood:
     """Return the likelihood of changes of the known parameters of sensors.
 
@@ -166,6 +167,8 @@ def change_likelihood(
     displaced
         What Q displacements of all poses together do to each of N: right perturbations per unit,
         radians before metres, shape (N, 6, Q).
+    map_errors
+        How many times as large as it states the map's errors count.
 
     Returns
     -------
@@ -179,7 +182,7 @@ def change_likelihood(
     )
     view = observe(readings, field_map, estimate, 1)
     errors = field_map if isinstance(field_map, UncertainMap) else NothingShared()
-    coverage = cover(view, errors, estimate, correlation_s)
+    coverage = cover(view, errors, estimate, correlation_s).with_larger_errors(map_errors)
     noise = group_noise(view, field_map, coverage, estimate)
     J, e = _linearised(view.readings, field_map, estimate, displaced)
     by_number = _number_errors(view.readings, np.concatenate([each.number_sigma for each in known]))

@@ -54,10 +54,12 @@ from l2m_gtsam.validation.places import (
     PlaceOrVehicle,
     is_elsewhere,
     is_searched,
+    spread,
     who_changed,
 )
 from l2m_gtsam.validation.recheck import SensorDrive, finite, inside, recheck, usable
 
+OF_PLACE = {CalibrationPart.PLACE, CalibrationPart.ROTATION}  # that a displacement changes
 NO_STEEL = "the readings show no steel that came or went"
 
 
@@ -136,7 +138,7 @@ def validate(
         who = who_changed([each.sensor for each in known], [parts_of(each) for each in found])
         notes = (f"What changed is of {who}, not of the place: {NO_STEEL}.", *notes)
     return DriveValidation(
-        sensors=tuple(each for each in found if isinstance(each, ValidatedSensor)),
+        sensors=tuple(_tests(found)),
         missing=(*missing, *(each for each in found if isinstance(each, NotValidated))),
         drive=drive_metrics(recording),
         picture=map_picture(field_map, places),
@@ -268,9 +270,19 @@ def _test_of_shifts(
     known: Sequence[SensorCalibration],
     found: Sequence[ValidatedSensor | NotValidated],
 ) -> DisplacementTest | None:
-    """Return the test of displacements of all sensors together; none where there are none."""
+    """Return the test of displacements of all sensors together; none where there are none.
+
+    What has changed of sensors and cannot be of a displacement is free in it.
+    """
     kept = _kept(known, found)
-    return DisplacementTest.of(test.on_drive(kept)) if kept else None
+    if not kept:
+        return None
+    sensors, parts = test.on_drive(kept), [parts_of(each) for each in _tests(found)]
+    free = (
+        P + spread(one.distortion.C, tuple(part for part in own if part not in OF_PLACE))
+        for P, one, own in zip(sensors.spreads, kept, parts, strict=True)
+    )
+    return DisplacementTest.of(replace(sensors, spreads=tuple(free)))
 
 
 def _beside_displacement(
@@ -312,6 +324,11 @@ def _others(
         changed = replace(test, field_map=ChangedMap(test.field_map, shown.found))
         others.append(Explained.by(changed.on_drive(kept), shown.found.parameters, test.chance))
     return others
+
+
+def _tests(found: Sequence[ValidatedSensor | NotValidated]) -> list[ValidatedSensor]:
+    """Return what was found of sensors that could be tested."""
+    return [each for each in found if isinstance(each, ValidatedSensor)]
 
 
 def _kept(
