@@ -296,7 +296,7 @@ class DisplacementTest:
 
 
 @dataclass(frozen=True)
-class Explained:
+class ExplainedDrive:
     """Sensors on a drive after something that explains their readings, and what is left of them.
 
     Attributes
@@ -314,7 +314,7 @@ class Explained:
     parameters: int
 
     @classmethod
-    def by(cls, sensors: SensorsOnDrive, freedom: int, chance: float) -> "Explained":
+    def by(cls, sensors: SensorsOnDrive, freedom: int, chance: float) -> "ExplainedDrive":
         """Test sensors beside what so many numbers describe."""
         tests = tuple(sensors.rechecked(chance))
         return cls(sensors, tests, freedom + sum(map(width, parts_of(tests))))
@@ -330,7 +330,7 @@ def common_displacement(
     sensors: SensorsOnDrive,
     test: DisplacementTest,
     chance: float,
-    others: Callable[[], Sequence[Explained]],
+    others: Callable[[], Sequence[ExplainedDrive]],
 ) -> tuple[PoseDisplacement, Displacement] | None:
     """Return the displacement that all sensors share, as poses take it and as it is reported.
 
@@ -354,9 +354,9 @@ def common_displacement(
     ]
     if not found:
         return None
-    alone = Explained.by(sensors, 0, chance)
+    alone = ExplainedDrive.by(sensors, 0, chance)
     shared = [
-        Explained.by(sensors.displaced(each.displacement), len(each.columns), chance)
+        ExplainedDrive.by(sensors.displaced(each.displacement), len(each.columns), chance)
         for each in found
     ]
     best = min(each.score for each in shared)

@@ -41,7 +41,7 @@ from l2m_gtsam.records.validation import (
 from l2m_gtsam.solve.correction import without_moving
 from l2m_gtsam.validation.displacement import (
     DisplacementTest,
-    Explained,
+    ExplainedDrive,
     SensorsOnDrive,
     common_displacement,
 )
@@ -311,7 +311,7 @@ def _others(
     test: _Test,
     known: Sequence[SensorCalibration],
     found: Sequence[ValidatedSensor | NotValidated],
-) -> list[Explained]:
+) -> list[ExplainedDrive]:
     """Return what explains readings beside a displacement: courses of H, and steel."""
     kept, averages = _kept(known, found), _averaged(test, known, found)
     if averages is None:
@@ -319,10 +319,12 @@ def _others(
     others = []
     if averages.courses:
         sensors = replace(test, courses=(*test.courses, *averages.courses)).on_drive(kept)
-        others.append(Explained.by(sensors, averages.found_courses.parameters, test.chance))
+        others.append(ExplainedDrive.by(sensors, averages.found_courses.parameters, test.chance))
     if (shown := averages.shown) is not None:
         changed = replace(test, field_map=ChangedMap(test.field_map, shown.found))
-        others.append(Explained.by(changed.on_drive(kept), shown.found.parameters, test.chance))
+        others.append(
+            ExplainedDrive.by(changed.on_drive(kept), shown.found.parameters, test.chance)
+        )
     return others
 
 
