@@ -145,6 +145,8 @@ def calibrated(
         moved=movement(recording.trajectory.R, recording.trajectory.p),
     )
     result = _result(recording, drive, changed, solved_map, options, map_source)
+    jumps = tuple(_jump_in_own_time(each, recording) for each in jumping.jumps)
+    result = replace(result, jumps=jumps)
     return Calibrated(result, outcome.solution, solved_map, solver_map)
 
 
@@ -185,7 +187,6 @@ def _result(
         pose_duration=solution.pose_duration,
         unseen_warp_m=solution.unseen_warp_m,
         sources=changed.records,
-        jumps=tuple(_jump_in_own_time(each, recording) for each in jumping.jumps),
         recorded=tuple(map(_recorded, recording.parts)),
     )
 

@@ -20,7 +20,7 @@ from l2m_gtsam.calibration.changed_places import (
 )
 from l2m_gtsam.calibration.coverage import Correction, UncertainMap
 from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
-from l2m_gtsam.calibration.offset_jumps import jumps_of
+from l2m_gtsam.calibration.offset_courses import courses_of
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, IntArray, Readings
@@ -84,7 +84,7 @@ def shown_jumps(
     """Return the jumps of H that readings of a solve show beside its processes.
 
     They are looked for where something else than noise was found: a process, or places that differ
-    from the map. A sensor that jumps often wanders, which is a process.
+    from the map. A sensor that jumps often wanders, which is a process, as a drift is.
     """
     if not isinstance(field_map, UncertainMap) or solution.contradicted or not solution.placed:
         return ()
@@ -94,9 +94,10 @@ def shown_jumps(
     if not solution.budget.found and not len(suspected(drive, field_map, options.averaging)):
         return ()
     rows = drive.marginal(field_map, field_map, solution.budget, options.averaging)
-    shown = jumps_of(rows, drive).records(drive.view.readings)
-    often = Counter(each.sensor for each in shown)
-    return tuple(each for each in shown if often[each.sensor] < MOST_JUMPS)
+    shown = courses_of(rows, drive).records(drive.view.readings)
+    jumps = [each for each in shown if isinstance(each, OffsetJump)]
+    often = Counter(each.sensor for each in jumps)
+    return tuple(each for each in jumps if often[each.sensor] < MOST_JUMPS)
 
 
 def _solved_beside(

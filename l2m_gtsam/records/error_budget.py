@@ -135,6 +135,27 @@ class OffsetJump(Record):
 
 
 @dataclass(frozen=True)
+class OffsetDrift(Record):
+    """H that drifts steadily over a drive.
+
+    Attributes
+    ----------
+    sensor
+        Of which.
+    stamp_ns, seconds
+        When the drive begins, and how long it is.
+    change, sigma
+        H at the end less H at the beginning and its standard deviation, uT.
+    """
+
+    sensor: str
+    stamp_ns: int
+    seconds: float
+    change: Row
+    sigma: Row
+
+
+@dataclass(frozen=True)
 class Unmodelled:
     """How many times larger the scatter of a drive's parts is than noise, map and poses explain.
 

@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import AliasChoices, Field
 
 from l2m_gtsam.data import SaturatedAxis
-from l2m_gtsam.records.error_budget import OffsetJump
+from l2m_gtsam.records.error_budget import OffsetDrift, OffsetJump
 from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Series
 from l2m_gtsam.records.places import ChangedSource, WhatChanged
 from l2m_gtsam.records.provenance import NamedSource
@@ -110,9 +110,10 @@ class CalibrationChange(Record):
 
 @dataclass(frozen=True)
 class MinimumDetectableChange(Record):
-    """The smallest change of a part that surely shows: on a drive, all others as calibrated.
+    """The smallest change of a part that shows: on a drive, all others as calibrated.
 
-    Five standard deviations, in the units of ``CalibrationChange``; infinite where it shows none.
+    Its test misses it once in a hundred times, in its worst direction. In the units of
+    ``CalibrationChange``; infinite where it shows none.
     """
 
     part: CalibrationPart
@@ -240,6 +241,18 @@ class Displacement(Record):
 
 
 @dataclass(frozen=True)
+class DetectableShift(Record):
+    """The smallest shift of all sensors together that a drive shows, with nothing else changed.
+
+    Its test misses it once in a hundred times, in its worst direction. In metres; infinite where it
+    shows none.
+    """
+
+    of: Displaced
+    size: float
+
+
+@dataclass(frozen=True)
 class DriveValidation(Record):
     """A calibration beside a drive.
 
@@ -257,8 +270,12 @@ class DriveValidation(Record):
         What the readings say of place and vehicle, the best first; empty where no steel is seen.
     displacement
         What all sensors share. Their own changes are those beside it.
+    detectable_shifts
+        Of what all sensors share, that the drive would have shown.
     jumps
         Of H during the drive, in order of time. Other changes of H are those before the first.
+    drifts
+        Of H over the drive. Other changes of H are those at its beginning.
     """
 
     sensors: tuple[ValidatedSensor, ...]
@@ -270,7 +287,9 @@ class DriveValidation(Record):
     sources: tuple[ChangedSource, ...] = ()
     explanations: tuple[WhatChanged, ...] = ()
     displacement: Displacement | None = None
+    detectable_shifts: tuple[DetectableShift, ...] = ()
     jumps: tuple[OffsetJump, ...] = ()
+    drifts: tuple[OffsetDrift, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtrc, gammainccinv, gammaincinv, gammaln, xlogy
+from scipy.special import chdtrc, chndtrinc, gammainccinv, gammaincinv, gammaln, xlogy
 
 from l2m_gtsam.data import FloatArray
 
@@ -30,6 +30,24 @@ def exceeded_by(share: Any, freedom: Any) -> FloatArray:
     NaN where there is no freedom.
     """
     return np.asarray(2 * gammainccinv(_known(freedom) / 2, share))
+
+
+def noticed_sigmas(freedom: int, chance: float, missed: float) -> float:
+    """Return how long a mean of so many coordinates has to be for a test to notice it.
+
+    In standard deviations: of values with such a mean the squared length is of a noncentral
+    chi-square distribution.
+
+    Parameters
+    ----------
+    freedom
+        Number of coordinates.
+    chance
+        Share of means of zero that the test takes for another.
+    missed
+        Share of such means that it misses.
+    """
+    return float(np.sqrt(chndtrinc(exceeded_by(chance, freedom), freedom, missed)))
 
 
 def density(value: FloatArray, freedom: float) -> FloatArray:

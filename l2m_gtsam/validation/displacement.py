@@ -2,26 +2,38 @@
 
 Sensors that moved alike against the lidar were hardly all knocked off their mounts: the lidar's
 mount gave way, or poses are given in another frame than the map. Either is one rigid motion of all
-poses. It is followed by Gauss-Newton steps, with the calibrations held to their covariances; then
-each sensor is tested at the displaced poses, and the whole stands beside what changes of single
-sensors explain of the same readings, each with what its parameters cost.
+poses. It is tested in the readings of all sensors together: each by itself need not show it, as a
+frame that is displaced looks like no change of a sensor where the vehicle turns. Then it is
+followed by Gauss-Newton steps, with the calibrations held to their covariances, each sensor is
+tested at the displaced poses, and the whole stands beside what else explains the same readings,
+each with what its parameters cost.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from l2m_factors import skew
 from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.coverage import errors_over_stated
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, Readings, RigidTransform, Trajectory
+from l2m_gtsam.qa.metrics.changes import MISSED
 from l2m_gtsam.qa.metrics.coordinates import PARAMETERS, width
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.records.places import CLEAR
-from l2m_gtsam.records.validation import CalibrationPart, Displaced, Displacement
+from l2m_gtsam.records.validation import (
+    CalibrationPart,
+    DetectableShift,
+    Displaced,
+    Displacement,
+)
+from l2m_gtsam.solve.chi_square import chance_beyond, noticed_sigmas
 from l2m_gtsam.validation.innovation import (
     ChangeLikelihood,
     KnownCalibration,
@@ -43,9 +55,6 @@ FREEDOMS = 6
 TURN, SHIFT = range(3), range(3, 6)
 COLUMNS = (tuple(SHIFT), tuple(TURN), (*TURN, *SHIFT))  # that a displacement may have
 FURTHEST_RAD = 0.5  # that it is followed
-OF_PLACE = {CalibrationPart.PLACE, CalibrationPart.ROTATION}
-# Displacements are the last coordinates of a likelihood, behind those of a calibration.
-BEHIND = np.vstack([np.zeros((PARAMETERS, FREEDOMS)), np.eye(FREEDOMS)])
 
 
 @dataclass(frozen=True)
@@ -101,6 +110,9 @@ class SensorsOnDrive:
     ----------
     drives, known, spreads
         Readings, calibrations and covariances, (16, 16) and finite, of S sensors.
+    alike
+        Share of each covariance that errors have which the calibrations of several sensors may
+        have in common, as those of map and poses.
     field_map
         The map.
     options
@@ -110,6 +122,7 @@ class SensorsOnDrive:
     drives: tuple[SensorDrive, ...]
     known: tuple[KnownCalibration, ...]
     spreads: tuple[FloatArray, ...]
+    alike: tuple[float, ...]
     field_map: QueryableMap
     options: OneKeyOptions
 
@@ -123,19 +136,33 @@ class SensorsOnDrive:
         pairs = zip(self.drives, self.known, strict=True)
         return [usable(drive, self.field_map, known, self.options) for drive, known in pairs]
 
-    def likelihood(self, here: PoseDisplacement) -> ChangeLikelihood:
-        """Return the likelihood of a further displacement of poses displaced so far."""
-        rows, rest = [], 0.0
-        lasting_s = self.options.pose_noise.lasting_s
-        each = zip(self.drives, self.known, self.spreads, self.usable(), strict=True)
-        for drive, known, spread, used in each:
-            readings = drive.at(float(known.vector[15])).select(used)
-            whole = change_likelihood(readings, self.field_map, known, lasting_s, here.features)
-            own = marginalise_calibration(whole, spread, BEHIND)
-            rows.append(np.column_stack([own.root, own.white]))
-            rest += own.rest
-        found = ChangeLikelihood.of(np.concatenate(rows))
-        return replace(found, rest=found.rest + rest)
+    def likelihood(self, *here: PoseDisplacement) -> ChangeLikelihood:
+        """Return the likelihood of further displacements, each of poses displaced so far."""
+        each = zip(self.drives, self.known, self.usable(), strict=True)
+        parts = [drive.at(float(known.vector[15])).select(used) for drive, known, used in each]
+        whole = change_likelihood(
+            parts,
+            self.field_map,
+            self.known,
+            self.options.pose_noise.lasting_s,
+            lambda readings: np.concatenate([by.features(readings) for by in here], axis=2),
+            # What a map is wrong by beyond what it states is alike for all sensors.
+            errors_over_stated(self.field_map),
+        )
+        # Displacements are the last coordinates, behind those of the calibrations.
+        free = FREEDOMS * len(here)
+        behind = np.vstack([np.zeros((PARAMETERS * len(parts), free)), np.eye(free)])
+        return marginalise_calibration(whole, self._largest_covariance(), behind)
+
+    def _largest_covariance(self) -> FloatArray:
+        """Return what the covariance of all calibrations together is no larger than.
+
+        How errors of two sensors are correlated is in no file. Whatever it is, those of S that may
+        be alike are no larger than S times as large and not correlated (Cauchy and Schwarz).
+        """
+        count = len(self.spreads)
+        each = zip(self.spreads, self.alike, strict=True)
+        return np.asarray(block_diag(*(P * (1 - a + count * a) for P, a in each)))
 
     def rechecked(self, chance: float) -> list[Recheck]:
         """Return a test of each sensor."""
@@ -205,42 +232,144 @@ def followed(sensors: SensorsOnDrive, start: PoseDisplacement) -> FollowedDispla
     return FollowedDisplacement(here, columns, covariance)
 
 
+@dataclass(frozen=True)
+class DisplacementTest:
+    """The test of displacements of lidar and frame in the readings of all sensors.
+
+    Attributes
+    ----------
+    starts
+        Displacements by nothing.
+    likelihood
+        Of one of each, one after the other.
+    price
+        What each number of a displacement has to explain (the BIC).
+    """
+
+    starts: tuple[PoseDisplacement, ...]
+    likelihood: ChangeLikelihood
+    price: float
+
+    @classmethod
+    def of(cls, sensors: SensorsOnDrive) -> "DisplacementTest":
+        """Test sensors; of a single one a displacement of the lidar is its own."""
+        middles = {
+            Displaced.LIDAR: np.mean([each.vector[:3] for each in sensors.known], axis=0),
+            Displaced.FRAME: sensors.drives[0].trajectory.p.mean(axis=0),
+        }
+        starts = tuple(
+            PoseDisplacement(of, at, np.zeros(FREEDOMS))
+            for of, at in middles.items()
+            if of is Displaced.FRAME or len(sensors.known) > 1
+        )
+        count = sum(int(used.sum()) for used in sensors.usable())
+        return cls(starts, sensors.likelihood(*starts), float(np.log(3 * count)))
+
+    def shown(self, chance: float) -> list[PoseDisplacement]:
+        """Return those that explain more than chance does, and than they cost."""
+        return [
+            start
+            for k, start in enumerate(self.starts)
+            if any(
+                chance_beyond(self.likelihood.explained(at), len(at)) < self._least(len(at), chance)
+                for at in self._columns(k)
+            )
+        ]
+
+    def detectable(self, chance: float) -> tuple[DetectableShift, ...]:
+        """Return the smallest shifts that are shown."""
+        sigmas = noticed_sigmas(len(SHIFT), self._least(len(SHIFT), chance), MISSED)
+        found = []
+        for k, start in enumerate(self.starts):
+            shift, *_ = self._columns(k)
+            least = float(np.linalg.svd(self.likelihood.root[:, shift], compute_uv=False)[-1])
+            found.append(DetectableShift(start.of, sigmas / least if least > 0 else float("inf")))
+        return tuple(found)
+
+    def _least(self, freedom: int, chance: float) -> float:
+        """Return how seldom chance has to do as much as a displacement with so many numbers."""
+        each = chance / (len(self.starts) * len(COLUMNS))  # Bonferroni
+        return min(each, float(chance_beyond(freedom * self.price, freedom)))
+
+    def _columns(self, start: int) -> list[list[int]]:
+        return [[FREEDOMS * start + k for k in at] for at in COLUMNS]
+
+
+@dataclass(frozen=True)
+class ExplainedDrive:
+    """Sensors on a drive after something that explains their readings, and what is left of them.
+
+    Attributes
+    ----------
+    sensors
+        Beside that.
+    tests
+        Of each.
+    parameters
+        How many numbers describe what happened, with the parts of sensors that changed besides.
+    """
+
+    sensors: SensorsOnDrive
+    tests: tuple[Recheck, ...]
+    parameters: int
+
+    @classmethod
+    def by(cls, sensors: SensorsOnDrive, freedom: int, chance: float) -> "ExplainedDrive":
+        """Test sensors beside what so many numbers describe."""
+        tests = tuple(sensors.rechecked(chance))
+        return cls(sensors, tests, freedom + sum(map(width, parts_of(tests))))
+
+    @cached_property
+    def score(self) -> float:
+        """What is left, and what the parameters cost (the BIC)."""
+        price = np.log(3 * sum(len(each.used) for each in self.tests))
+        return self.sensors.left(self.tests) + float(price) * self.parameters
+
+
 def common_displacement(
-    sensors: SensorsOnDrive, chance: float
+    sensors: SensorsOnDrive,
+    test: DisplacementTest,
+    chance: float,
+    others: Callable[[], Sequence[ExplainedDrive]],
 ) -> tuple[PoseDisplacement, Displacement] | None:
     """Return the displacement that all sensors share, as poses take it and as it is reported.
 
-    None where changes of single sensors explain their readings as well.
+    None where something else explains their readings as well.
 
     Parameters
     ----------
     sensors
-        Two or more of which changed.
+        Of one vehicle.
+    test
+        Of them.
     chance
         Of calling a change what is none.
+    others
+        Asked for what else may explain them, beside changes of single sensors.
     """
-    poses = sensors.drives[0].trajectory
-    middles = {
-        Displaced.LIDAR: np.mean([each.vector[:3] for each in sensors.known], axis=0),
-        Displaced.FRAME: poses.p.mean(axis=0),
-    }
-    starts = [PoseDisplacement(of, at, np.zeros(FREEDOMS)) for of, at in middles.items()]
-    found = [each for each in (followed(sensors, start) for start in starts) if each is not None]
-    every = [sensors, *(sensors.displaced(each.displacement) for each in found)]
-    tests = [each.rechecked(chance) for each in every]
-    price = np.log(3 * sum(len(each.used) for each in tests[0]))
-    freedoms = [0, *(len(each.columns) for each in found)]
-    scores = [
-        where.left(own) + price * (freedom + sum(map(width, parts_of(own))))
-        for where, own, freedom in zip(every, tests, freedoms, strict=True)
+    found = [
+        each
+        for each in (followed(sensors, start) for start in test.shown(chance))
+        if each is not None
     ]
-    alone, shared = scores[0], sorted(zip(scores[1:], range(len(found)), strict=True))
-    if not shared or shared[0][0] >= alone:
+    if not found:
         return None
-    good = [k for score, k in shared if score - shared[0][0] < CLEAR]
+    alone = ExplainedDrive.by(sensors, 0, chance)
+    shared = [
+        ExplainedDrive.by(sensors.displaced(each.displacement), len(each.columns), chance)
+        for each in found
+    ]
+    best = min(each.score for each in shared)
+    # Where no sensor has changed, the test of the displacement has decided.
+    changed = any(each.parts for each in alone.tests)
+    if best > (alone.score - CLEAR if changed else np.inf):
+        return None
+    if any(each.score <= best for each in others()):
+        return None
+    good = [k for k, each in enumerate(shared) if each.score - best < CLEAR]
     told = found[min(good)]  # of two that explain as much the lidar's, which stands first
-    of = tuple(found[k].displacement.of for k in sorted(good))
-    return told.displacement, told.record(of, float(alone - shared[0][0]))
+    of = tuple(found[k].displacement.of for k in good)
+    return told.displacement, told.record(of, alone.score - best)
 
 
 def parts_of(tests: Sequence[Recheck]) -> list[CalibrationPart]:

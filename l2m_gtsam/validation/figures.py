@@ -8,7 +8,7 @@ from scipy.stats import chi2, f
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import IntArray, SourceFile, same_content
 from l2m_gtsam.maps.field_map import Summarised
-from l2m_gtsam.qa.metrics.changes import DETECTED_SIGMAS, change_of
+from l2m_gtsam.qa.metrics.changes import change_of
 from l2m_gtsam.qa.metrics.coordinates import COLUMNS, PARAMETERS, columns_of, width
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import curves, field_error, fit_figures, series
@@ -51,6 +51,7 @@ def sensor_figures(
     sensor: SensorCalibration,
     found: Recheck,
     thinning: Thinning,
+    chance: float,
 ) -> ValidatedSensor:
     """Return the figures of one sensor.
 
@@ -64,6 +65,8 @@ def sensor_figures(
         The test of that on the drive.
     thinning
         How much of the drive is kept.
+    chance
+        Of the test.
     """
     readings = drive.at(offset_s(sensor))
     place = readings.R_map_lidar @ sensor.t_lidar_mag + readings.p_map_lidar
@@ -89,7 +92,7 @@ def sensor_figures(
         parameters=_chi_square(likelihood.explained(range(PARAMETERS)), freedom[1]),
         changes=_changes(found),
         detectable=tuple(
-            MinimumDetectableChange(part, detectable_change(likelihood, part, DETECTED_SIGMAS))
+            MinimumDetectableChange(part, detectable_change(likelihood, part, chance))
             for part in COLUMNS
         ),
         series=series(fields, evidence, thinning.start_ns, thinning.most),

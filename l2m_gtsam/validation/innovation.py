@@ -15,9 +15,10 @@ part has) and named one after the other.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from l2m_factors import M, P, U
 from l2m_factors.shared_errors import whitened
@@ -26,10 +27,11 @@ from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
 from l2m_gtsam.calibration.group_noise import group_noise
 from l2m_gtsam.calibration.pose_errors import pose_features
 from l2m_gtsam.calibration.view import QueryableMap, observe
-from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.data import FloatArray, Readings, joined_rows
+from l2m_gtsam.qa.metrics.changes import MISSED
 from l2m_gtsam.qa.metrics.coordinates import COLUMNS, columns_of, width
 from l2m_gtsam.records.validation import CalibrationPart
-from l2m_gtsam.solve.chi_square import chance_beyond
+from l2m_gtsam.solve.chi_square import chance_beyond, noticed_sigmas
 
 ROWS = 4000  # that are reduced at once
 UNOBSERVABLE = 1e-9  # of the best observed direction of a part: zero but for rounding
@@ -142,40 +144,49 @@ def held_poses(readings: Readings) -> FloatArray:
 
 
 def change_likelihood(
-    readings: Readings,
+    parts: Sequence[Readings],
     field_map: QueryableMap,
-    known: KnownCalibration,
+    known: Sequence[KnownCalibration],
     correlation_s: float,
     displaced: Callable[[Readings], FloatArray] = held_poses,
+    map_errors: float = 1.0,
 ) -> ChangeLikelihood:
-    """Return the likelihood of changes of a sensor's known parameters.
+    """Return the likelihood of changes of the known parameters of sensors.
+
+    Errors of the map and of the poses are those of all of them together.
 
     Parameters
     ----------
-    readings
-        Of one sensor, all inside the map, with their poses at the known time offset; what follows
-        recorded numbers is taken off.
+    parts
+        Readings of each of S sensors, all inside the map, with their poses at the known time
+        offset; what follows recorded numbers is taken off.
     known
-        The calibration, whose own errors do not count here.
+        Their calibrations, whose own errors do not count here.
     correlation_s
         How long an error of a pose lasts, seconds.
     displaced
         What Q displacements of all poses together do to each of N: right perturbations per unit,
         radians before metres, shape (N, 6, Q).
+    map_errors
+        How many times as large as it states the map's errors count.
 
     Returns
     -------
     ChangeLikelihood
-        Of a change of (t, C row by row, H, time offset), then of such displacements.
+        Of a change of (t, C row by row, H, time offset) sensor by sensor, then of such
+        displacements.
     """
-    estimate = known.estimate()
+    readings = together(parts)
+    estimate = estimate_of(
+        np.array([each.vector for each in known]), np.array([each.noise for each in known])
+    )
     view = observe(readings, field_map, estimate, 1)
     errors = field_map if isinstance(field_map, UncertainMap) else NothingShared()
-    coverage = cover(view, errors, estimate, correlation_s)
+    coverage = cover(view, errors, estimate, correlation_s).with_larger_errors(map_errors)
     noise = group_noise(view, field_map, coverage, estimate)
     J, e = _linearised(view.readings, field_map, estimate, displaced)
-    by_number = _number_errors(view.readings, known.number_sigma)
-    C, at = estimate.C()[0], coverage.columns
+    by_number = _number_errors(view.readings, np.concatenate([each.number_sigma for each in known]))
+    C, at = estimate.C(), coverage.columns
     shared = sum(coverage.sizes.values())
     numbers = slice(shared, shared + by_number.shape[2])
     width = numbers.stop + J.shape[2] + 1
@@ -183,12 +194,25 @@ def change_likelihood(
     for group, own, W in zip(coverage.groups, noise.errors, noise.whitenings, strict=True):
         rows = np.zeros((3 * len(group.rows), width))
         for each in own:
-            rows[:, at[each.key]] += whitened(W, C @ each.features)
+            rows[:, at[each.key]] += whitened(W, C[group.sensor] @ each.features)
         rows[:, numbers] = whitened(W, by_number[group.rows])
         rows[:, numbers.stop : -1] = whitened(W, J[group.rows])
         rows[:, -1:] = whitened(W, e[group.rows, :, None])
         collected.add(rows)
     return ChangeLikelihood.of(collected.root()[numbers.stop :, numbers.stop :])
+
+
+def together(parts: Sequence[Readings]) -> Readings:
+    """Return readings of single sensors as those of all, each with its own recorded numbers."""
+    sensor = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
+    names = tuple(each.sensors[0] for each in parts)
+    none = (np.empty((len(each), 0)) for each in parts)
+    numbers = [
+        empty if each.regressors is None else each.regressors
+        for each, empty in zip(parts, none, strict=True)
+    ]
+    joined = joined_rows([replace(each, sensors=names, regressors=None) for each in parts])
+    return replace(joined, sensor=sensor, regressors=block_diag(*numbers))
 
 
 class _SequentialQR:
@@ -237,11 +261,15 @@ def _linearised(
     estimate: Estimate,
     displaced: Callable[[Readings], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives of predicted readings, (N, 3, 16 + Q), and innovations in uT, (N, 3)."""
-    batch = batch_readings(readings, field_map)
-    found = batch.residuals(estimate.values([0]), 0)
+    """Return derivatives of predicted readings, (N, 3, 16 S + Q), and innovations, uT, (N, 3)."""
+    batch, sensors = batch_readings(readings, field_map), len(estimate.t)
+    found = batch.residuals(estimate.values(batch.sensors), batch.sensors[0])
+    own = np.concatenate(batch.jacobians(found), axis=2)
+    by_sensor = np.zeros((*own.shape[:2], sensors, own.shape[2]))
+    by_sensor[np.arange(len(own)), :, readings.sensor] = own
     by_pose = pose_features(displaced(readings), found.b_lidar, found.slope, found.t_lidar_mag)
-    return np.concatenate([*batch.jacobians(found), found.C @ by_pose], axis=2), -found.residual
+    J = [by_sensor.reshape(*own.shape[:2], -1), found.C @ by_pose]
+    return np.concatenate(J, axis=2), -found.residual
 
 
 def _number_errors(readings: Readings, sigma: FloatArray) -> FloatArray:
@@ -260,9 +288,9 @@ def marginalise_calibration(
     Parameters
     ----------
     likelihood
-        Of t, C row by row, H and the time offset, and of what else there is.
+        Of t, C row by row, H and the time offset of S sensors, and of what else there is.
     covariance
-        Of the calibration, shape (16, 16), finite.
+        Of their calibrations, shape (16 S, 16 S), finite.
     basis
         Change of all these per unit of each of Q coordinates of a change, shape (P, Q).
     """
@@ -319,8 +347,9 @@ def is_observable(likelihood: ChangeLikelihood, part: CalibrationPart) -> bool:
     return bool(np.linalg.norm(likelihood.root[:, COLUMNS[part]], axis=0).all())
 
 
-def detectable_change(likelihood: ChangeLikelihood, part: CalibrationPart, sigmas: float) -> float:
-    """Return the largest standard deviation of a part by itself, so many times; maybe infinite."""
+def detectable_change(likelihood: ChangeLikelihood, part: CalibrationPart, chance: float) -> float:
+    """Return the smallest change of a part by itself that `parts_changed` shows; maybe infinite."""
     own = likelihood.root[:, COLUMNS[part]]
     values = np.linalg.svd(own, compute_uv=False)
+    sigmas = noticed_sigmas(own.shape[1], chance / len(COLUMNS), MISSED)
     return float(sigmas / values[-1]) if values[-1] > UNOBSERVABLE * values[0] else float("inf")

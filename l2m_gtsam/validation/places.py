@@ -7,6 +7,7 @@ sensors that a test named without sources, parts that it names beside them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -14,18 +15,17 @@ from l2m_gtsam.calibration.averaged_rows import AveragedDrive, averaged, with_ca
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources
 from l2m_gtsam.calibration.changed_places import ChangesOptions, is_place_of, suspected
-from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
 from l2m_gtsam.calibration.drive_sources import DriveSources, drive_sources
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.offset_jumps import FoundJumps, jumps_of
+from l2m_gtsam.calibration.offset_courses import Course, FoundCourses, courses_of
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import FloatArray, Readings, joined_rows
+from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.sources.found_sources import FoundSources, price, refined
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.qa.metrics.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.validation import EXPECTED_TIMES
-from l2m_gtsam.records.error_budget import OffsetJump
 from l2m_gtsam.records.places import CLEAR, ChangedSource, WhatChanged
 from l2m_gtsam.records.validation import (
     CalibrationPart,
@@ -161,82 +161,93 @@ def capitalised(words: str) -> str:
 
 
 @dataclass(frozen=True)
-class SuspectedDrive:
-    """A drive that differs from the map by more than that may err.
+class AveragedBesideMap:
+    """A drive, averaged, beside what map and calibrations predict.
 
     Attributes
     ----------
-    rows, drive
-        Averaged readings, the sensors free.
+    drive
+        Averaged readings.
     places
-        Where it does, metres, shape (M, 3).
+        Where they differ from the map by more than that may err, metres, shape (M, 3).
     field_map, options
         The map, and how sources are looked for.
     """
 
-    rows: MarginalRows
     drive: AveragedDrive
     places: FloatArray
     field_map: QueryableMap
     options: ChangesOptions
 
-    def sources(self) -> DriveSources:
-        """Return the sources that it shows."""
+    @classmethod
+    def of(
+        cls,
+        readings: Readings,
+        field_map: QueryableMap,
+        estimate: Estimate,
+        options: ChangesOptions,
+    ) -> "AveragedBesideMap":
+        """Average a drive.
+
+        Parameters
+        ----------
+        readings
+            Of S sensors, inside the map, at their calibrated time offsets.
+        estimate
+            The calibration.
+        options
+            How to look for sources.
+        """
+        every = np.ones(len(readings), dtype=np.bool_)
+        averages = averaged(readings, field_map, estimate, every, options.averaging)
+        drive = AveragedDrive.of(averages, field_map, estimate)
+        return cls(drive, suspected(drive, field_map, options.averaging), field_map, options)
+
+    @cached_property
+    def rows(self) -> MarginalRows:
+        """The averaged readings, the sensors free."""
+        errors = self.field_map if isinstance(self.field_map, UncertainMap) else NothingShared()
+        return self.drive.marginal(self.field_map, errors, NOTHING_FOUND, self.options.averaging)
+
+    @cached_property
+    def sources(self) -> DriveSources | None:
+        """The sources that it shows; none where steel is not looked for, or no place suspected."""
+        if not (len(self.places) and is_searched(self.field_map, self.options)):
+            return None
         return drive_sources(
             self.rows, self.drive, self.places, self.field_map, self.options.sources
         )
 
-    def jumps(self) -> tuple[OffsetJump, ...]:
-        """Return the jumps of H that explain all, or more than sources, or what these leave."""
-        found = jumps_of(self.rows, self.drive)
-        if found.each and self.is_suspected_beside(found):
-            shown = self.sources()
+    @property
+    def shown(self) -> ShownSources | None:
+        """What changed at the place by them; none where nothing stands out."""
+        if self.sources is None:
+            return None
+        found = self.sources.of_changes()
+        return ShownSources(self.sources.rows, self.drive, found) if len(found) else None
+
+    @property
+    def courses(self) -> tuple[Course, ...]:
+        """Jumps and drifts of H that explain all, or more than sources, or what these leave."""
+        return self.found_courses.records(self.drive.view.readings)
+
+    @cached_property
+    def found_courses(self) -> FoundCourses:
+        """The same as they were found."""
+        found = courses_of(self.rows, self.drive)
+        if found.each and self.is_suspected_beside(found) and self.sources is not None:
+            shown = self.sources
             if shown.gain > found.gain:
                 left = self.rows.residual - shown.found.field(self.rows.points)
-                found = jumps_of(replace(shown.rows, residual=left), self.drive)
-        return found.records(self.drive.view.readings)
+                found = courses_of(replace(shown.rows, residual=left), self.drive)
+        return found
 
-    def is_suspected_beside(self, found: FoundJumps) -> bool:
-        """Return whether places are suspected beside jumps."""
+    def is_suspected_beside(self, found: FoundCourses) -> bool:
+        """Return whether places are suspected beside jumps and drifts."""
         averages = self.drive.averages
         left = replace(averages, residual=averages.residual - found.field)
         beside = replace(self.drive, averages=left)
         return bool(len(suspected(beside, self.field_map, self.options.averaging)))
-
-
-def suspected_drive(
-    readings: Readings, field_map: QueryableMap, estimate: Estimate, options: ChangesOptions
-) -> SuspectedDrive | None:
-    """Return a drive on which steel may have come or gone; none where no place is suspected.
-
-    Parameters
-    ----------
-    readings
-        Of S sensors, inside the map, at their calibrated time offsets.
-    estimate
-        The calibration.
-    options
-        How to look for sources.
-    """
-    if not (isinstance(field_map, UncertainMap) and is_searched(field_map, options)):
-        return None
-    every = np.ones(len(readings), dtype=np.bool_)
-    averages = averaged(readings, field_map, estimate, every, options.averaging)
-    drive = AveragedDrive.of(averages, field_map, estimate)
-    places = suspected(drive, field_map, options.averaging)
-    if not len(places):
-        return None
-    rows = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
-    return SuspectedDrive(rows, drive, places, field_map, options)
-
-
-def shown_sources(suspect: SuspectedDrive | None) -> ShownSources | None:
-    """Return sources that a drive shows; none where none stands out."""
-    if suspect is None:
-        return None
-    shown = suspect.sources()
-    found = shown.of_changes()
-    return ShownSources(shown.rows, suspect.drive, found) if len(found) else None
 
 
 def is_elsewhere(
@@ -282,9 +293,3 @@ def spread(C: FloatArray, parts: Parts) -> FloatArray:
     at = columns_of(parts)
     root = changes_of(C)[:, at] * sigma[at]
     return np.asarray(root @ root.T)
-
-
-def together(parts: Sequence[Readings], names: tuple[str, ...]) -> Readings:
-    """Return readings of single sensors as those of all."""
-    sensor = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
-    return replace(joined_rows(parts), sensors=names, sensor=sensor, regressors=None, drive=None)

@@ -185,7 +185,7 @@ def about(
 ) -> ChangeLikelihood:
     """Return the likelihood of a change of a calibration, linearised there."""
     readings = drive.at(float(here.vector[15])).select(used)
-    return change_likelihood(readings, field_map, here, options.pose_noise.lasting_s)
+    return change_likelihood((readings,), field_map, (here,), options.pose_noise.lasting_s)
 
 
 def left_by(

@@ -7,9 +7,9 @@ import numpy as np
 
 from l2m_gtsam.calibration.calibrate import prepare
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.offset_jumps import ANYTHING_UT, without_jump
+from l2m_gtsam.calibration.offset_courses import ANYTHING_UT, Course, without_course
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.calibration.view import QueryableMap, for_solvers, places_of
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import (
     FloatArray,
     Readings,
@@ -29,7 +29,7 @@ from l2m_gtsam.recording.drive_trace import is_of
 from l2m_gtsam.recording.saturation import saturation_sentence
 from l2m_gtsam.recording.sync import stuck_sensors
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
-from l2m_gtsam.records.error_budget import OffsetJump
+from l2m_gtsam.records.error_budget import ErrorCause, OffsetDrift, OffsetJump
 from l2m_gtsam.records.validation import (
     CalibrationPart,
     Displacement,
@@ -38,22 +38,26 @@ from l2m_gtsam.records.validation import (
     ValidatedSensor,
 )
 from l2m_gtsam.solve.correction import without_moving
-from l2m_gtsam.validation.displacement import OF_PLACE, SensorsOnDrive, common_displacement
+from l2m_gtsam.validation.displacement import (
+    DisplacementTest,
+    ExplainedDrive,
+    SensorsOnDrive,
+    common_displacement,
+)
 from l2m_gtsam.validation.exchange import TestedSensor, exchanged
 from l2m_gtsam.validation.figures import Thinning, doubts_and_notes, offset_s, sensor_figures
-from l2m_gtsam.validation.innovation import KnownCalibration, estimate_of
+from l2m_gtsam.validation.innovation import KnownCalibration, estimate_of, together
 from l2m_gtsam.validation.places import (
+    AveragedBesideMap,
     PlaceOrVehicle,
-    SuspectedDrive,
     is_elsewhere,
     is_searched,
-    shown_sources,
-    suspected_drive,
-    together,
+    spread,
     who_changed,
 )
-from l2m_gtsam.validation.recheck import SensorDrive, finite, recheck
+from l2m_gtsam.validation.recheck import SensorDrive, finite, inside, recheck, usable
 
+OF_PLACE = {CalibrationPart.PLACE, CalibrationPart.ROTATION}  # that a displacement changes
 NO_STEEL = "the readings show no steel that came or went"
 
 
@@ -114,9 +118,13 @@ def validate(
         progress("validating", index / len(known))
         found.append(_tested(test, sensor))
     test, known, found = _as_exchanged(test, known, found)
-    test, found, displacement = _beside_displacement(test, known, found)
-    test, found, suspect = _beside_jumps(test, known, found)
-    judged, beside = _judged(test, known, found, suspect)
+    shift_test = _test_of_shifts(test, known, found)
+    test, found, displacement = _beside_displacement(test, known, found, shift_test)
+    test, found = _beside_courses(test, known, found)
+    if displacement is None and test.courses:
+        again = _test_of_shifts(test, known, found)
+        test, found, displacement = _beside_displacement(test, known, found, again)
+    judged, beside = _judged(test, known, found)
     if judged is not None and judged.best.of_place:
         field_map, found = ChangedMap(field_map, judged.found), beside
     progress("validating", 1.0)
@@ -128,7 +136,7 @@ def validate(
         who = who_changed([each.sensor for each in known], [parts_of(each) for each in found])
         notes = (f"What changed is of {who}, not of the place: {NO_STEEL}.", *notes)
     return DriveValidation(
-        sensors=tuple(each for each in found if isinstance(each, ValidatedSensor)),
+        sensors=tuple(_tests(found)),
         missing=(*missing, *(each for each in found if isinstance(each, NotValidated))),
         drive=drive_metrics(recording),
         picture=map_picture(field_map, places),
@@ -137,7 +145,9 @@ def validate(
         sources=() if judged is None else judged.sources,
         explanations=() if judged is None else judged.explanations,
         displacement=displacement,
-        jumps=test.jumps,
+        detectable_shifts=() if shift_test is None else shift_test.detectable(chance),
+        jumps=tuple(each for each in test.courses if isinstance(each, OffsetJump)),
+        drifts=tuple(each for each in test.courses if isinstance(each, OffsetDrift)),
     )
 
 
@@ -159,8 +169,8 @@ class _Test:
         As of `validate`.
     thinning
         How much of the drive is kept.
-    jumps
-        Of H that are taken off the readings.
+    courses
+        Jumps and drifts of H that are taken off the readings.
     reads_as
         By the name of a sensor that of another, whose calibration its readings fit.
     """
@@ -173,26 +183,37 @@ class _Test:
     options: CalibrationOptions
     chance: float
     thinning: Thinning
-    jumps: tuple[OffsetJump, ...] = ()
+    courses: tuple[Course, ...] = ()
     reads_as: Mapping[str, str] = field(default_factory=dict)
 
     def drive_of(self, sensor: SensorCalibration) -> SensorDrive:
-        """Return what a sensor read, without what follows recorded numbers and without jumps."""
+        """Return what a sensor read, without what follows recorded numbers and courses of H."""
         found = drive_of(self.readings, self.recording, sensor)
         own = found.readings
-        for jump in self.jumps_of(sensor):
-            own = without_jump(own, jump)
+        for course in self.courses_of(sensor):
+            own = without_course(own, course)
         return replace(found, readings=own)
 
     def known(self, sensor: SensorCalibration) -> KnownCalibration:
-        """Return its calibration; a jump is a number whose field may be anything."""
-        found, jumps = _known(self.recording, sensor), len(self.jumps_of(sensor))
-        anything = np.full((jumps, 3), ANYTHING_UT)
+        """Return its calibration; a course of H is a number whose field may be anything."""
+        found, courses = _known(self.recording, sensor), len(self.courses_of(sensor))
+        anything = np.full((courses, 3), ANYTHING_UT)
         return replace(found, number_sigma=np.concatenate([found.number_sigma, anything]))
 
-    def jumps_of(self, sensor: SensorCalibration) -> tuple[OffsetJump, ...]:
-        """Return the jumps of a sensor."""
-        return tuple(each for each in self.jumps if each.sensor == sensor.sensor)
+    def courses_of(self, sensor: SensorCalibration) -> tuple[Course, ...]:
+        """Return the jumps and drifts of a sensor."""
+        return tuple(each for each in self.courses if each.sensor == sensor.sensor)
+
+    def on_drive(self, known: Sequence[SensorCalibration]) -> SensorsOnDrive:
+        """Return sensors with their calibrations."""
+        return SensorsOnDrive(
+            tuple(map(self.drive_of, known)),
+            tuple(map(self.known, known)),
+            tuple(finite(joint_covariance(each), self.options.solve) for each in known),
+            tuple(map(alike_share, known)),
+            self.field_map,
+            self.options.solve,
+        )
 
 
 def _test_of(
@@ -242,23 +263,39 @@ def _as_exchanged(
     return test, known, [_tested(test, each) for each in known]
 
 
+def _test_of_shifts(
+    test: _Test,
+    known: Sequence[SensorCalibration],
+    found: Sequence[ValidatedSensor | NotValidated],
+) -> DisplacementTest | None:
+    """Return the test of displacements of all sensors together; none where there are none.
+
+    What has changed of sensors and cannot be of a displacement is free in it.
+    """
+    kept = _kept(known, found)
+    if not kept:
+        return None
+    sensors, parts = test.on_drive(kept), [parts_of(each) for each in _tests(found)]
+    free = (
+        P + spread(one.distortion.C, tuple(part for part in own if part not in OF_PLACE))
+        for P, one, own in zip(sensors.spreads, kept, parts, strict=True)
+    )
+    return DisplacementTest.of(replace(sensors, spreads=tuple(free)))
+
+
 def _beside_displacement(
     test: _Test,
     known: Sequence[SensorCalibration],
     found: list[ValidatedSensor | NotValidated],
+    shift_test: DisplacementTest | None,
 ) -> tuple[_Test, list[ValidatedSensor | NotValidated], Displacement | None]:
     """Return the displacement that sensors share, if they do, and what is found beside it."""
-    kept = _kept(known, found)
-    if sum(not OF_PLACE.isdisjoint(parts_of(each)) for each in found) < 2:
+    if shift_test is None:
         return test, found, None
-    sensors = SensorsOnDrive(
-        tuple(map(test.drive_of, kept)),
-        tuple(map(test.known, kept)),
-        tuple(finite(joint_covariance(each), test.options.solve) for each in kept),
-        test.field_map,
-        test.options.solve,
+    sensors = test.on_drive(_kept(known, found))
+    shared = common_displacement(
+        sensors, shift_test, test.chance, lambda: _others(test, known, found)
     )
-    shared = common_displacement(sensors, test.chance)
     if shared is None:
         return test, found, None
     by, record = shared
@@ -266,6 +303,32 @@ def _beside_displacement(
     displaced = replace(test, recording=replace(test.recording, trajectory=poses))
     beside = [_tested(displaced, each) for each in known]
     return (test, found, None) if is_elsewhere(found, beside) else (displaced, beside, record)
+
+
+def _others(
+    test: _Test,
+    known: Sequence[SensorCalibration],
+    found: Sequence[ValidatedSensor | NotValidated],
+) -> list[ExplainedDrive]:
+    """Return what explains readings beside a displacement: courses of H, and steel."""
+    kept, averages = _kept(known, found), _averaged(test, known, found)
+    if averages is None:
+        return []
+    others = []
+    if averages.courses:
+        sensors = replace(test, courses=(*test.courses, *averages.courses)).on_drive(kept)
+        others.append(ExplainedDrive.by(sensors, averages.found_courses.parameters, test.chance))
+    if (shown := averages.shown) is not None:
+        changed = replace(test, field_map=ChangedMap(test.field_map, shown.found))
+        others.append(
+            ExplainedDrive.by(changed.on_drive(kept), shown.found.parameters, test.chance)
+        )
+    return others
+
+
+def _tests(found: Sequence[ValidatedSensor | NotValidated]) -> list[ValidatedSensor]:
+    """Return what was found of sensors that could be tested."""
+    return [each for each in found if isinstance(each, ValidatedSensor)]
 
 
 def _kept(
@@ -276,41 +339,43 @@ def _kept(
     return [one for one, each in pairs if isinstance(each, ValidatedSensor)]
 
 
-def _suspected(test: _Test, kept: Sequence[SensorCalibration]) -> SuspectedDrive | None:
-    """Return the drive if places are suspected on it."""
+def _averaged(
+    test: _Test,
+    known: Sequence[SensorCalibration],
+    found: Sequence[ValidatedSensor | NotValidated],
+) -> AveragedBesideMap | None:
+    """Return the averaged drive if places are suspected on it, or sensors changed."""
+    kept = _kept(known, found)
     if not kept:
         return None
     readings, estimate = _of_all(test, kept)
-    return suspected_drive(readings, test.field_map, estimate, test.options.changes)
+    averages = AveragedBesideMap.of(readings, test.field_map, estimate, test.options.changes)
+    return averages if len(averages.places) or any(map(parts_of, found)) else None
 
 
-def _beside_jumps(
+def _beside_courses(
     test: _Test,
     known: Sequence[SensorCalibration],
     found: list[ValidatedSensor | NotValidated],
-) -> tuple[_Test, list[ValidatedSensor | NotValidated], SuspectedDrive | None]:
-    """Return the test without jumps of H, what is found then, and the drive if it is suspected."""
-    suspect = _suspected(test, _kept(known, found))
-    jumps = () if suspect is None else suspect.jumps()
-    if not jumps:
-        return test, found, suspect
-    without = replace(test, jumps=jumps)
+) -> tuple[_Test, list[ValidatedSensor | NotValidated]]:
+    """Return the test without jumps and drifts of H, and what is found then."""
+    averages = _averaged(test, known, found)
+    if averages is None or not averages.courses:
+        return test, found
+    without = replace(test, courses=averages.courses)
     beside = [_tested(without, each) for each in known]
-    if is_elsewhere(found, beside):
-        return test, found, suspect
-    return without, beside, _suspected(without, _kept(known, beside))
+    return (test, found) if is_elsewhere(found, beside) else (without, beside)
 
 
 def _judged(
     test: _Test,
     known: Sequence[SensorCalibration],
     found: Sequence[ValidatedSensor | NotValidated],
-    suspect: SuspectedDrive | None,
 ) -> tuple[PlaceOrVehicle | None, list[ValidatedSensor | NotValidated]]:
     """Return whether the place changed or the vehicle, and what is found if the place did."""
     kept = _kept(known, found)
-    shown = shown_sources(suspect)
-    if shown is None:
+    averages = _averaged(test, known, found)
+    if averages is None or (shown := averages.shown) is None:
         return None, []
     changed = replace(test, field_map=ChangedMap(test.field_map, shown.found))
     beside = [_tested(changed, sensor) for sensor in known]
@@ -330,15 +395,25 @@ def parts_of(found: ValidatedSensor | NotValidated) -> tuple[CalibrationPart, ..
 
 
 def _of_all(test: _Test, known: Sequence[SensorCalibration]) -> tuple[Readings, Estimate]:
-    """Return the readings of sensors inside the map, and their calibrations."""
-    names = tuple(each.sensor for each in known)
-    parts = [test.drive_of(each).at(offset_s(each)) for each in known]
+    """Return the readings of sensors inside the map, and their calibrations.
+
+    Where steel is not looked for, without those that it may explain: it would look like jumps.
+    """
+    drives = [test.drive_of(each) for each in known]
     calibrations = [test.known(each) for each in known]
+    searched = is_searched(test.field_map, test.options.changes)
+    counts = [
+        inside(drive, test.field_map, each)
+        if searched
+        else usable(drive, test.field_map, each, test.options.solve)
+        for drive, each in zip(drives, calibrations, strict=True)
+    ]
     vectors = np.array([each.vector for each in calibrations])
     estimate = estimate_of(vectors, np.array([each.noise for each in calibrations]))
-    readings = together(parts, names)
-    inside = test.field_map.query(places_of(readings, estimate.t)).inside
-    return readings.select(inside), estimate
+    readings = together(
+        [drive.at(offset_s(each)) for drive, each in zip(drives, known, strict=True)]
+    )
+    return readings.select(np.concatenate(counts)), estimate
 
 
 def _tested(test: _Test, sensor: SensorCalibration) -> ValidatedSensor | NotValidated:
@@ -350,7 +425,7 @@ def _tested(test: _Test, sensor: SensorCalibration) -> ValidatedSensor | NotVali
         return NotValidated(sensor.sensor, f"{beyond}{reason}", faulty=True)
     known, covariance = test.known(sensor), joint_covariance(sensor)
     found = recheck(drive, test.field_map, known, covariance, options.solve, test.chance)
-    figures = sensor_figures(drive, test.field_map, sensor, found, test.thinning)
+    figures = sensor_figures(drive, test.field_map, sensor, found, test.thinning, test.chance)
     return replace(figures, limits=limits, reads_as=test.reads_as.get(sensor.sensor, ""))
 
 
@@ -389,6 +464,15 @@ def joint_covariance(sensor: SensorCalibration) -> FloatArray:
         joint[15, :15] = joint[:15, 15] = offset.cross_covariance
         joint[15, 15] = offset.sigma**2
     return joint
+
+
+def alike_share(sensor: SensorCalibration) -> float:
+    """Return the share of the variances of a calibration that others may have in common with it.
+
+    All but the noise of the readings; all, where the file does not tell.
+    """
+    own = [each for each in sensor.variance_shares if each.cause is ErrorCause.NOISE]
+    return 1 - min((share for each in own for share in (each.t, each.C, each.H)), default=0.0)
 
 
 def _known(recording: Recording, sensor: SensorCalibration) -> KnownCalibration:

@@ -24,10 +24,9 @@ from l2m_gtsam.records.validation import (
     NotValidated,
 )
 from l2m_gtsam.records.verdict import Level
-from l2m_gtsam.solve.chi_square import chance_beyond
+from l2m_gtsam.solve.chi_square import chance_beyond, noticed_sigmas
 
-DETECTED_SIGMAS = 5.0  # a change of so many is missed once in a hundred times, or less often
-DETECTED_BY_WHOLE = 6.2  # the same among fifteen parameters instead of three
+MISSED = 0.01  # of changes that are called detectable
 TINY = 1e-12  # of the largest variance, in units of sigmas: a direction that both share exactly
 INDEPENDENT = (
     "The errors of both calibrations count as independent: the covariance of their difference is "
@@ -62,14 +61,20 @@ class CalibrationDifference:
         sigma = np.sqrt(np.diag(self.covariance))
         return np.asarray(np.where(self.known, sigma, np.inf))
 
-    @property
-    def detectable(self) -> float:
-        """The smallest difference that surely shows, whatever its direction; infinite if none."""
+    def detectable(self, chance: float) -> float:
+        """Return the smallest difference that shows, whatever its direction; infinite if none.
+
+        Parameters
+        ----------
+        chance
+            Of the test of all entries.
+        """
         if not self.known.all():
             return float("inf")
-        return float(DETECTED_SIGMAS * np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+        sigmas = noticed_sigmas(len(self.value), chance, MISSED)
+        return float(sigmas * np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
 
-    def detectable_by_whole(self, basis: FloatArray) -> float:
+    def detectable_by_whole(self, basis: FloatArray, chance: float) -> float:
         """Return the smallest change of a part that the test of all entries shows.
 
         Parameters
@@ -77,6 +82,8 @@ class CalibrationDifference:
         basis
             What a unit of each of its coordinates does to the entries, shape (P, Q), with all that
             is known or open as it is.
+        chance
+            Of that test.
         """
         known = self.known
         touched = np.abs(basis).max(axis=1) > 0
@@ -87,7 +94,8 @@ class CalibrationDifference:
         columns = basis[known] / sigma[:, None]
         information = columns.T @ np.linalg.pinv(S, rcond=TINY, hermitian=True) @ columns
         least = float(np.linalg.eigvalsh(information)[0])
-        return DETECTED_BY_WHOLE / least**0.5 if least > 0 else float("inf")
+        sigmas = noticed_sigmas(int(known.sum()), chance, MISSED)
+        return sigmas / least**0.5 if least > 0 else float("inf")
 
     def part(self, at: slice) -> "CalibrationDifference":
         """Return some of its entries."""
@@ -167,6 +175,7 @@ def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float
     """Return what has changed of one sensor."""
     whole = CalibrationDifference(new.vector() - old.vector(), new.covariance + old.covariance)
     parts = differences(new, old, whole)
+    least = chance / (len(parts) + 1)  # Bonferroni: all parts and the whole are tested
     tests = {part.value: each.tested(part.value) for part, each in parts.items()}
     tests["C"] = whole.part(slice(3, 12)).tested("C")
     tests["all"] = whole.tested("all")
@@ -175,9 +184,9 @@ def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float
         difference=row(np.where(whole.known, whole.value, np.nan), 9),
         sigma=row(whole.sigma, 9),
         tests=tuple(tests.values()),
-        changes=_changes(parts, tests, chance),
+        changes=_changes(parts, tests, least),
         detectable=tuple(
-            MinimumDetectableChange(part, _detectable(part, each, whole, old))
+            MinimumDetectableChange(part, _detectable(part, each, whole, old, least))
             for part, each in parts.items()
         ),
     )
@@ -188,10 +197,11 @@ def _detectable(
     own: CalibrationDifference,
     whole: CalibrationDifference,
     old: SensorCalibration,
+    chance: float,
 ) -> float:
     """Return the smallest change of a part by itself that its test or that of all shows."""
     basis = changes_of(old.distortion.C)[: len(whole.value), COLUMNS[part]]
-    return min(own.detectable, whole.detectable_by_whole(basis))
+    return min(own.detectable(chance), whole.detectable_by_whole(basis, chance))
 
 
 def differences(
@@ -251,12 +261,8 @@ def _changes(
     tests: Mapping[str, ChangeTest],
     chance: float,
 ) -> tuple[CalibrationChange, ...]:
-    """Return the parts that chance does not explain, the surest first.
-
-    All parts and the whole are tested: each gets its share of the chance to be wrong.
-    """
-    least = chance / (len(parts) + 1)  # Bonferroni
-    named = [part for part in parts if tests[part.value].chance < least]
+    """Return the parts that chance does not explain, the surest first."""
+    named = [part for part in parts if tests[part.value].chance < chance]
     named.sort(key=lambda part: -tests[part.value].chi_square / max(tests[part.value].freedom, 1))
     return tuple(
         change_of(part, parts[part].value, parts[part].sigma, tests[part.value].chance)

@@ -18,7 +18,9 @@ from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, place_of
 from l2m_gtsam.qa.verdict.validation import NAMES, amount
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.validation import (
+    CalibrationPart,
     ComparedSensor,
+    Displaced,
     DriveValidation,
     ValidatedSensor,
     Validation,
@@ -71,6 +73,7 @@ def validation_page(found: Validation, identity: Identity) -> str:
             verdict=found.verdict,
             sections=[_section(k, each, found) for k, each in enumerate(found.verdict.sensors)],
             pictures={} if found.drive is None else pictures(_figures(found.drive)),
+            shifts="" if found.drive is None else _detectable_shifts(found.drive),
             thresholds=found.thresholds,
             parameters=PARAMETERS,
             length=np.linalg.norm,
@@ -114,6 +117,17 @@ def _section(index: int, verdict: SensorVerdict, found: Validation) -> Validatio
     anchor, detectable = f"sensor-{index}", "" if tested is None else _detectable(tested)
     shown = pictures(figures, anchor)
     return ValidationSection(anchor, verdict, tested, compared, detectable, shown)
+
+
+def _detectable_shifts(drive: DriveValidation) -> str:
+    """Return which shifts of all sensors together the drive would have shown, as a sentence."""
+    what = {Displaced.LIDAR: "all sensors together", Displaced.FRAME: "the frame of the poses"}
+    shown = " and ".join(
+        f"a shift of {what[each.of]} by {amount(CalibrationPart.PLACE, each.size)}"
+        for each in drive.detectable_shifts
+        if np.isfinite(each.size)
+    )
+    return f"With nothing else changed, this drive would show {shown} or more." if shown else ""
 
 
 def _detectable(sensor: ValidatedSensor) -> str:

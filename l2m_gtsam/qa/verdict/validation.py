@@ -9,7 +9,7 @@ from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions, thresholds
 from l2m_gtsam.qa.verdict.places import source_reasons
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, beyond_range, outside_map
 from l2m_gtsam.qa.verdict.uncertainty import jump_sentence
-from l2m_gtsam.records.error_budget import MOST_JUMPS
+from l2m_gtsam.records.error_budget import MOST_JUMPS, OffsetDrift
 from l2m_gtsam.records.validation import (
     CalibrationChange,
     CalibrationComparison,
@@ -78,6 +78,7 @@ def judge_validation(
                     *_exchanged(sensor),
                     *_moved_with_all(drive, options),
                     *_jumped(drive, sensor, options),
+                    *_drifted(drive, sensor, options),
                     *_on_sensor(sensor, options),
                 ]
             )
@@ -123,13 +124,14 @@ def _displaced(drive: DriveValidation, options: QaOptions) -> list[Reason]:
     """Return the displacement that all sensors share, and what it is likely of."""
     found = drive.displacement
     if found is None:
-        return []
+        return _blind_to_shifts(drive, options)
     level, count = _displaced_level(found, options), len(drive.sensors)
     if Displaced.LIDAR not in found.of:
+        what = f"all {count} sensors read" if count > 1 else "is read"
         text = (
-            f"What all {count} sensors read fits if the poses are {_moved_by(found, 'map')}: their "
-            "frame is not that of the map. Take poses on the map's point cloud. The sensors were "
-            "tested with poses that were moved so."
+            f"What {what} fits if the poses are {_moved_by(found, 'map')}: their frame is not that "
+            "of the map. Take poses on the map's point cloud. The sensors were tested with poses "
+            "that were moved so."
         )
         return [Reason(min(level, Level.WARN, key=lambda each: each.rank), text)]
     tied = ", or the poses are in another frame than the map's" if len(found.of) > 1 else ""
@@ -139,6 +141,23 @@ def _displaced(drive: DriveValidation, options: QaOptions) -> list[Reason]:
         "beside it."
     )
     return [Reason(level, text)]
+
+
+def _blind_to_shifts(drive: DriveValidation, options: QaOptions) -> list[Reason]:
+    """Return which shifts of all sensors together, as large as fails, need not have shown."""
+    limit = options.validation.place_m.fail
+    what = {Displaced.LIDAR: "of all sensors together", Displaced.FRAME: "of the poses' frame"}
+    hidden = " and ".join(
+        f"{what[each.of]} (it shows {amount(CalibrationPart.PLACE, each.size)} and more)"
+        if np.isfinite(each.size)
+        else f"{what[each.of]} (it shows none)"
+        for each in drive.detectable_shifts
+        if each.size > limit
+    )
+    if not hidden:
+        return []
+    text = f"This drive cannot rule out a shift by {amount(CalibrationPart.PLACE, limit)} {hidden}."
+    return [Reason(Level.WARN, text)]
 
 
 def _moved_with_all(drive: DriveValidation, options: QaOptions) -> list[Reason]:
@@ -201,6 +220,23 @@ def _jumped(drive: DriveValidation, sensor: ValidatedSensor, options: QaOptions)
         "it. Other changes of it may be of that."
     )
     return [Reason(limit.level(whole.size), text)]
+
+
+def _drifted(drive: DriveValidation, sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
+    """Return that its H drifted over the drive."""
+    own = [each for each in drive.drifts if each.sensor == sensor.sensor]
+    return [_of_drift(each, options) for each in own]
+
+
+def _of_drift(drift: OffsetDrift, options: QaOptions) -> Reason:
+    """Return that H drifted, by how much and why."""
+    change, sigma = np.array(drift.change), np.array(drift.sigma)
+    whole = change_of(CalibrationPart.OFFSET, change, sigma, 0.0)
+    text = (
+        f"Over the drive its offset H drifts by {by_how_much(whole)}: the sensor warms up, or "
+        "something on the vehicle gains or loses magnetisation. Its other changes are beside that."
+    )
+    return Reason(options.validation.offset_ut.level(whole.size), text)
 
 
 def _misfit(sensor: ValidatedSensor, options: QaOptions) -> bool:

@@ -12,7 +12,12 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.validation import judge_validation
-from l2m_gtsam.records.validation import CalibrationPart, Displaced, DriveValidation
+from l2m_gtsam.records.validation import (
+    CalibrationPart,
+    DetectableShift,
+    Displaced,
+    DriveValidation,
+)
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.studies.validation.drives import (
     CalibratedHall,
@@ -85,6 +90,59 @@ def test_poses_in_another_frame_are_told_at_once() -> None:
     verdict = judge_validation(found, None, QaOptions())
     assert verdict.reasons[0].level is Level.WARN
     assert "their frame is not that of the map" in verdict.reasons[0].text
+
+
+def in_frame_displaced(recording: Recording, shift: FloatArray) -> Recording:
+    """Return a drive whose poses have to be moved by this in metres, shape (3,)."""
+    poses = recording.trajectory
+    return replace(recording, trajectory=replace(poses, p=poses.p - shift))
+
+
+def test_a_displacement_that_no_sensor_shows_by_itself_is_told() -> None:
+    """Where the vehicle turns, a frame that is displaced looks like no change of a sensor."""
+    shift = np.array([0.012, 0.012, 0.0])
+    found = on_drive(in_frame_displaced(other_drive(), shift))
+    assert found.displacement is not None
+    assert found.displacement.of == (Displaced.FRAME,)
+    assert_near(found.displacement.shift, found.displacement.shift_sigma, shift)
+
+
+@pytest.mark.parametrize("shift", [(0.03, 0.0, 0.0), (0.0, 0.03, 0.0)])
+def test_a_displacement_is_told_beside_the_errors_of_a_map(shift: tuple[float, ...]) -> None:
+    options, place = hall()
+    recording = changed_drive(options, place, TrueCause.NOTHING, 1).recording
+    displaced = in_frame_displaced(recording, np.array(shift))
+    found = validate(displaced, place.field_map, place.calibration, CalibrationOptions(), 1e-3)
+    assert found.displacement is not None
+    assert found.displacement.of == (Displaced.FRAME,)
+    assert_near(found.displacement.shift, found.displacement.shift_sigma, np.array(shift))
+    assert found.sources == ()
+
+
+def test_a_single_sensor_shows_a_displaced_frame() -> None:
+    shift = np.array([0.03, 0.03, 0.0])
+    recording = in_frame_displaced(other_drive(), shift)
+    found = on_drive(replace(recording, series=recording.series[:1]))
+    assert found.displacement is not None
+    assert_near(found.displacement.shift, found.displacement.shift_sigma, shift)
+    assert "What is read fits if the poses are moved" in text(
+        judge_validation(found, None, QaOptions())
+    )
+
+
+def test_what_a_drive_does_not_show_of_a_displacement_is_told() -> None:
+    found = on_drive(other_drive())
+    assert found.displacement is None
+    assert [each.of for each in found.detectable_shifts] == [Displaced.LIDAR, Displaced.FRAME]
+    assert all(0 < each.size < 0.03 for each in found.detectable_shifts)
+    assert "rule out a shift" not in text(judge_validation(found, None, QaOptions()))
+    blind = replace(found, detectable_shifts=(DetectableShift(Displaced.LIDAR, 0.05),))
+    verdict = judge_validation(blind, None, QaOptions())
+    assert verdict.level == "warn"
+    assert (
+        "This drive cannot rule out a shift by 30 mm of all sensors together (it shows 50 mm and "
+        "more)."
+    ) in text(verdict)
 
 
 def test_sensors_that_moved_apart_are_told_one_by_one() -> None:
@@ -179,8 +237,54 @@ def test_h_that_jumps_again_and_again_wanders() -> None:
     assert "its offset H wanders, by 9." in told or "its offset H wanders, by 8." in told
 
 
+def drifting(recording: Recording, sensor: int, change: FloatArray) -> Recording:
+    """Return a drive over which H of a sensor drifts by this in uT, shape (3,)."""
+    series = list(recording.series)
+    stamp_ns = series[sensor].stamp_ns
+    share = (stamp_ns - stamp_ns.min()) / np.ptp(stamp_ns)
+    field = series[sensor].field + share[:, None] * change
+    series[sensor] = replace(series[sensor], field=field)
+    return replace(recording, series=tuple(series))
+
+
+@pytest.mark.parametrize("change", [(0.0, 1.0, 0.0), (1.5, 1.5, 0.0)])
+def test_a_drift_of_h_is_no_change_of_the_rest(change: tuple[float, ...]) -> None:
+    options, place = hall()
+    recording = changed_drive(options, place, TrueCause.NOTHING, 1).recording
+    drifts = drifting(recording, 0, np.array(change))
+    found = validate(drifts, place.field_map, place.calibration, CalibrationOptions(), 1e-3)
+    (drift,) = found.drifts
+    assert drift.sensor == found.sensors[0].sensor
+    assert_near(drift.change, drift.sigma, np.array(change))
+    assert found.jumps == ()
+    assert [each.changes for each in found.sensors] == [(), ()]
+    (first, second) = judge_validation(found, None, QaOptions()).sensors
+    assert "Over the drive its offset H drifts by" in " ".join(e.text for e in first.reasons)
+    assert not any("drifts" in each.text for each in second.reasons)
+
+
+def test_drifts_and_jumps_are_told_in_a_map_that_does_not_know_its_errors() -> None:
+    """On an exact map: what else is wrong there is in the readings that do not count."""
+    change, step = np.array([0.5, 0.3, 0.0]), np.array([0.5, 0.0, 0.0])
+    found = on_drive(drifting(other_drive(), 0, change))
+    (drift,) = found.drifts
+    assert drift.sensor == "mag_0"
+    assert_near(drift.change, drift.sigma, change)
+    assert [each.changes for each in found.sensors] == [(), (), ()]
+    recording = other_drive()
+    after = np.arange(len(recording.series[1].field)) > 150
+    field = recording.series[1].field + after[:, None] * step
+    series = (recording.series[0], replace(recording.series[1], field=field), recording.series[2])
+    found = on_drive(replace(recording, series=series))
+    (jump,) = found.jumps
+    assert jump.sensor == "mag_1"
+    assert_near(jump.change, jump.sigma, step)
+    assert [each.changes for each in found.sensors] == [(), (), ()]
+
+
 def test_steel_is_no_jump() -> None:
     found = after_jumps({}, TrueCause.PLACE)
-    assert found.jumps == ()
+    assert not found.jumps
+    assert not found.drifts
     assert found.displacement is None
     assert found.sources

@@ -101,11 +101,30 @@ def test_the_square_is_that_of_the_full_covariance(
     P[:15, :15] = np.diag(SIGMA**2)
     e = readings.field.ravel() - prediction(readings, field_map, calibration.vector)
     S = dense(readings, field_map, calibration, P)
-    told = change_likelihood(readings, field_map, calibration, LASTS_S)
+    told = change_likelihood((readings,), field_map, (calibration,), LASTS_S)
     found = marginalise_calibration(told, P, changes_of(np.eye(3)))
     assert found.squared == pytest.approx(e @ np.linalg.solve(S, e), rel=1e-8)
     independent = NOISE**-2 * float(e @ e)
     assert found.squared < 0.8 * independent
+
+
+def test_sensors_share_the_errors_of_the_map(readings: Readings, field_map: HarmonicMap) -> None:
+    """Two at one place: the map is wrong once, not twice; written out with both in a row."""
+    first = known()
+    second = replace(first, vector=first.vector + np.append(np.full(3, 0.01), np.zeros(13)))
+    R, both = readings.R_map_lidar, (first, second)
+    e = np.concatenate(
+        [readings.field.ravel() - prediction(readings, field_map, each.vector) for each in both]
+    )
+    x = np.concatenate([R @ each.vector[:3] + readings.p_map_lidar for each in both])
+    CR = np.concatenate([each.vector[3:12].reshape(3, 3) @ R.transpose(0, 2, 1) for each in both])
+    modes = field_map.errors_over(x)
+    A = all_features(modes, x)
+    shared = (CR @ A).reshape(3 * len(x), -1)
+    S = block_diag(*own_noise(field_map, x, A, CR)) + shared @ modes.covariance @ shared.T
+    found = change_likelihood((readings, readings), field_map, (first, second), LASTS_S)
+    assert found.squared == pytest.approx(e @ np.linalg.solve(S, e), rel=1e-6)
+    assert found.root.shape == (32, 32)
 
 
 def test_errors_of_poses_last(readings: Readings, field_map: HarmonicMap) -> None:
@@ -130,5 +149,5 @@ def test_errors_of_poses_last(readings: Readings, field_map: HarmonicMap) -> Non
     alike = np.exp(-np.abs(seconds[:, None] - seconds) / LASTS_S)
     F = F.reshape(3 * count, 6)
     S = dense(readings, field_map, calibration, P) + F @ F.T * np.kron(alike, np.ones((3, 3)))
-    found = change_likelihood(moved, field_map, calibration, LASTS_S)
+    found = change_likelihood((moved,), field_map, (calibration,), LASTS_S)
     assert found.squared == pytest.approx(e @ np.linalg.solve(S, e), rel=1e-6)

@@ -23,6 +23,7 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.validation import judge_validation
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
 from l2m_gtsam.records.validation import CalibrationPart
+from l2m_gtsam.solve.chi_square import noticed_sigmas
 from tests.drives.calibrations import SIGMA, calibration, open_in, rotations, sensor, unsolved
 
 CHANCE = 1e-3
@@ -237,10 +238,11 @@ def test_what_both_calibrations_could_not_have_shown_is_a_warning() -> None:
     vague = plain(covariance=np.diag(sigma**2))
     found = compare_calibrations(calibration(vague), calibration(vague), CHANCE)
     (place,) = [e for e in found.sensors[0].detectable if e.part is CalibrationPart.PLACE]
-    assert place.size == pytest.approx(5 * np.sqrt(2) * 0.01)
+    sigmas = noticed_sigmas(3, CHANCE / 6, 0.01)
+    assert place.size == pytest.approx(sigmas * np.sqrt(2) * 0.01)
     (verdict,) = judge_validation(None, found, QaOptions()).sensors
     assert verdict.level == "warn"
-    assert "its place t (they show changes from 71 mm on)" in verdict.reasons[0].text
+    assert "its place t (they show changes from 94 mm on)" in verdict.reasons[0].text
 
 
 def test_a_change_by_itself_shows_where_its_part_is_known_with_others() -> None:
@@ -252,8 +254,9 @@ def test_a_change_by_itself_shows_where_its_part_is_known_with_others() -> None:
     S = 2 * known.covariance
     (offset,) = [each for each in found.detectable if each.part is CalibrationPart.OFFSET]
     least = np.linalg.eigvalsh(np.linalg.inv(S)[12:, 12:])[0]
-    assert offset.size == pytest.approx(6.2 / np.sqrt(least), rel=1e-6)
-    assert offset.size < 5 * found.sigma[12]
+    of_whole, of_part = (noticed_sigmas(freedom, CHANCE / 6, 0.01) for freedom in (15, 3))
+    assert offset.size == pytest.approx(of_whole / np.sqrt(least), rel=1e-6)
+    assert offset.size < of_part * found.sigma[12]
 
 
 def test_what_one_calibration_leaves_open_could_not_have_shown() -> None:

@@ -2,9 +2,15 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, ncx2
 
-from l2m_gtsam.solve.chi_square import chance_beyond, density, exceeded_by, quantile
+from l2m_gtsam.solve.chi_square import (
+    chance_beyond,
+    density,
+    exceeded_by,
+    noticed_sigmas,
+    quantile,
+)
 
 SHARES = np.array([0.0, 1e-9, 0.5, 0.95, 0.999, 1.0, np.nan])
 VALUES = np.array([-5.0, -1e-12, 0.0, 0.3, 7.81, 80.0, 1e4, np.inf, np.nan])
@@ -26,3 +32,9 @@ def test_several_freedoms_at_once() -> None:
 def test_densities(freedom: int) -> None:
     values = np.linspace(0, 40, 50)
     np.testing.assert_allclose(density(values, freedom), chi2.pdf(values, freedom), rtol=1e-12)
+
+
+@pytest.mark.parametrize("freedom", [1, 3, 15])
+def test_a_mean_that_is_noticed_is_missed_as_seldom_as_is_said(freedom: int) -> None:
+    sigmas = noticed_sigmas(freedom, 1e-3, 0.01)
+    assert ncx2.cdf(chi2.isf(1e-3, freedom), freedom, sigmas**2) == pytest.approx(0.01, rel=1e-6)

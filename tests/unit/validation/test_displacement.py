@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Readings, Trajectory
 from l2m_gtsam.records.validation import Displaced
-from l2m_gtsam.validation.displacement import PoseDisplacement
+from l2m_gtsam.validation.displacement import DisplacementTest, PoseDisplacement
+from l2m_gtsam.validation.innovation import ChangeLikelihood
 
 SEEDS = st.integers(0, 10_000)
 N = 4
@@ -48,3 +49,30 @@ def test_a_displacement_turns_about_its_centre(of: Displaced) -> None:
     by = PoseDisplacement(of, np.array([1.0, 2.0, 3.0]), np.array([0, 0, 0.3, 0.1, 0, 0]))
     at = by.transform.R @ by.centre + by.transform.t
     np.testing.assert_allclose(at, by.centre + np.array([0.1, 0, 0]))
+
+
+def shift_test(white: FloatArray) -> DisplacementTest:
+    """A test of a lidar and a frame, each coordinate with an information of its own."""
+    root = np.diag(np.repeat([300.0, 100.0, 200.0, 150.0], 3))
+    starts = tuple(PoseDisplacement(of, np.zeros(3), np.zeros(6)) for of in Displaced)
+    return DisplacementTest(starts, ChangeLikelihood(root, white, 0.0), np.log(1000))
+
+
+def test_a_detectable_shift_is_missed_once_in_a_hundred_times() -> None:
+    """2000 drives miss 20, and five standard errors more."""
+    rng, missed = np.random.default_rng(3), 0
+    (lidar, frame) = shift_test(np.zeros(12)).detectable(1e-3)
+    assert (lidar.of, frame.of) == (Displaced.LIDAR, Displaced.FRAME)
+    assert lidar.size == pytest.approx(1.5 * frame.size)
+    for _ in range(2000):
+        white = rng.normal(size=12)
+        white[3] += 100.0 * lidar.size
+        missed += not shift_test(white).shown(1e-3)
+    assert missed == pytest.approx(20, abs=5 * np.sqrt(20))
+
+
+def test_noise_shows_displacements_as_seldom_as_is_allowed() -> None:
+    """Two of 2000, and five standard errors more."""
+    rng = np.random.default_rng(4)
+    shown = sum(bool(shift_test(rng.normal(size=12)).shown(1e-3)) for _ in range(2000))
+    assert shown <= 2 + 5 * np.sqrt(2)

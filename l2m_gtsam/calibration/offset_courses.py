@@ -1,0 +1,217 @@
+"""H that changes during a drive: it jumps at one moment, or drifts all the time.
+
+A tool that is laid beside a sensor makes it jump, a sensor that warms up makes it drift. Against
+the map a jump looks like steel all along the rest of the path, and sources are found that imitate
+it; a drift looks like changes of C. Both are looked for in the same averaged readings as steel, the
+sensors free, and stand first if they explain more of them.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.averaged_rows import AveragedDrive
+from l2m_gtsam.calibration.causes import sensor_offsets
+from l2m_gtsam.data import FloatArray, IntArray, Readings
+from l2m_gtsam.maps.sources.found_sources import price
+from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.records.error_budget import MOST_JUMPS, OffsetDrift, OffsetJump
+
+AXES = 3
+MOMENTS = 40  # at which a jump is tried at once
+FEWEST = 5  # averages of the sensor before it, and after
+ANYTHING_UT = 100.0  # standard deviation of a jump or a drift before readings
+Course = OffsetJump | OffsetDrift
+
+
+@dataclass(frozen=True)
+class FoundCourse:
+    """A jump or a drift of H of one sensor.
+
+    Attributes
+    ----------
+    sensor
+        Its index.
+    stamp_ns
+        Of the first average after a jump; a drift has none.
+    features
+        What it does to averages per uT along the sensor's axes, map frame, shape (N, 3, 3).
+    """
+
+    sensor: int
+    stamp_ns: int | None
+    features: FloatArray
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers describe it: the moment of a jump is one."""
+        return AXES + (self.stamp_ns is not None)
+
+    def record(self, readings: Readings, change: FloatArray, sigma: FloatArray) -> Course:
+        """Return it as it is reported, changes and standard deviations in uT, shapes (3,)."""
+        name, start = readings.sensors[self.sensor], int(readings.stamp_ns.min())
+        own = tuple(change.tolist()), tuple(sigma.tolist())
+        if self.stamp_ns is None:
+            return OffsetDrift(name, start, 1e-9 * int(np.ptp(readings.stamp_ns)), *own)
+        return OffsetJump(name, self.stamp_ns, 1e-9 * (self.stamp_ns - start), *own)
+
+
+@dataclass(frozen=True)
+class FoundCourses:
+    """Jumps and drifts with the changes of H that explain most, and what these explain.
+
+    Attributes
+    ----------
+    each
+        J of them.
+    change, covariance
+        Of H in uT, one after the other, shapes (3 J,) and (3 J, 3 J).
+    gain
+        Twice the logarithm of the likelihood ratio, less what the parameters cost (the BIC).
+    """
+
+    each: tuple[FoundCourse, ...]
+    change: FloatArray
+    covariance: FloatArray
+    gain: float
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers describe all of them."""
+        return sum(each.parameters for each in self.each)
+
+    @property
+    def field(self) -> FloatArray:
+        """What they do to averages, map frame, uT, shape (N, 3)."""
+        return np.concatenate([each.features for each in self.each], axis=2) @ self.change
+
+    def records(self, readings: Readings) -> tuple[Course, ...]:
+        """Return them as they are reported, in order of time."""
+        sigma = np.sqrt(np.diag(self.covariance)).reshape(-1, AXES)
+        each = zip(self.each, self.change.reshape(-1, AXES), sigma, strict=True)
+        found = [course.record(readings, change, spread) for course, change, spread in each]
+        return tuple(sorted(found, key=lambda each: each.stamp_ns))
+
+
+def courses_of(rows: MarginalRows, drive: AveragedDrive) -> FoundCourses:
+    """Return the jumps and drifts that averaged readings show, the plainest first.
+
+    Parameters
+    ----------
+    rows, drive
+        The averaged readings, N of them, their sensors free.
+    """
+    present, each = np.unique(drive.view.readings.sensor).tolist(), sensor_offsets(drive)
+    offsets = dict(zip(present, np.split(each, len(present), axis=2), strict=True))
+    found, beside = list[FoundCourse](), rows
+    while True:
+        tried = list(_candidates(beside, drive, offsets, found))
+        net, best = max(tried, key=lambda each: each[0], default=(-np.inf, None))
+        if best is None or net < 0:
+            break
+        found.append(best)
+        beside = beside.beside(best.features, ANYTHING_UT)
+    return _needed(rows, _estimated(rows, found))
+
+
+def _needed(rows: MarginalRows, found: FoundCourses) -> FoundCourses:
+    """Return those without which less is explained: several jumps may make a drift needless."""
+    fewer = (
+        _estimated(rows, [each for each in found.each if each is not one]) for one in found.each
+    )
+    best = max(fewer, key=lambda each: each.gain, default=found)
+    return _needed(rows, best) if best.gain > found.gain else found
+
+
+def _candidates(
+    rows: MarginalRows,
+    drive: AveragedDrive,
+    offsets: Mapping[int, FloatArray],
+    found: Sequence[FoundCourse],
+) -> Iterator[tuple[float, FoundCourse]]:
+    """Yield the best jump and the drift of each sensor, with what it explains beyond its price."""
+    for sensor, own in offsets.items():
+        jumps = [each.stamp_ns is not None for each in found if each.sensor == sensor]
+        tried = [_jump(rows, drive, own, sensor)] if sum(jumps) < MOST_JUMPS else []
+        if all(jumps):
+            tried.append(_drift(rows, drive, own, sensor))
+        for gain, course in tried:
+            if course is not None:
+                yield gain - price(rows, course.parameters), course
+
+
+def _jump(
+    rows: MarginalRows, drive: AveragedDrive, own: FloatArray, sensor: int
+) -> tuple[float, FoundCourse | None]:
+    """Return the jump of a sensor that explains most: at some moments, then between two."""
+    stamps = np.sort(drive.view.readings.stamp_ns[drive.view.readings.sensor == sensor])
+    stamps = stamps[FEWEST : -FEWEST or None]
+    if not len(stamps):
+        return 0.0, None
+    at = np.arange(len(stamps))
+    while True:
+        few = at[np.unique(np.linspace(0, len(at) - 1, MOMENTS).astype(int))]
+        gains, features = _gains(rows, drive, own, stamps[few])
+        best = int(np.argmax(gains))
+        if len(few) == len(at):
+            jump = FoundCourse(sensor, int(stamps[few[best]]), features[best])
+            return float(gains[best]), jump
+        at = np.arange(few[max(best - 1, 0)], few[min(best + 1, len(few) - 1)] + 1)
+
+
+def _drift(
+    rows: MarginalRows, drive: AveragedDrive, own: FloatArray, sensor: int
+) -> tuple[float, FoundCourse | None]:
+    """Return the steady drift of a sensor."""
+    stamp_ns = drive.view.readings.stamp_ns
+    seconds = 1e-9 * (stamp_ns - stamp_ns.min())
+    if not seconds.any():
+        return 0.0, None
+    features = own * (seconds / seconds.max())[:, None, None]
+    pulled, _ = rows.pull(rows.residual)
+    return _gain(rows, pulled, features), FoundCourse(sensor, None, features)
+
+
+def _gains(
+    rows: MarginalRows, drive: AveragedDrive, own: FloatArray, stamps: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what jumps at M moments explain each, (M,), and what they do, (M, N, 3, 3)."""
+    after = drive.view.readings.stamp_ns >= stamps[:, None]
+    features = own * after[:, :, None, None]
+    pulled, _ = rows.pull(rows.residual)
+    return np.array([_gain(rows, pulled, each) for each in features]), features
+
+
+def _gain(rows: MarginalRows, pulled: FloatArray, features: FloatArray) -> float:
+    """Return what a course explains, if H may follow it by anything."""
+    pull = np.einsum("ni,nij->j", pulled, features)
+    return float(pull @ np.linalg.lstsq(rows.information(features), pull, rcond=1e-10)[0])
+
+
+def _estimated(rows: MarginalRows, found: Sequence[FoundCourse]) -> FoundCourses:
+    """Return jumps and drifts with the changes of H that explain most together."""
+    if not found:
+        return FoundCourses((), np.empty(0), np.empty((0, 0)), 0.0)
+    features = np.concatenate([each.features for each in found], axis=2)
+    pulled, _ = rows.pull(rows.residual)
+    covariance = np.asarray(np.linalg.inv(rows.information(features)))
+    pull = np.einsum("ni,nij->j", pulled, features)
+    change = np.asarray(covariance @ pull)
+    gain = float(pull @ change) - price(rows, sum(each.parameters for each in found))
+    return FoundCourses(tuple(found), change, covariance, gain)
+
+
+def without_course(readings: Readings, course: Course) -> Readings:
+    """Return readings of its sensor as if H had not changed; how much it did becomes a number's."""
+    stamp_ns = readings.stamp_ns
+    if isinstance(course, OffsetJump):
+        number = (stamp_ns >= course.stamp_ns).astype(float)
+    else:
+        number = 1e-9 * (stamp_ns - course.stamp_ns) / course.seconds
+    numbers = np.empty((len(readings), 0)) if readings.regressors is None else readings.regressors
+    return replace(
+        readings,
+        field=readings.field - number[:, None] * np.array(course.change),
+        regressors=np.column_stack([numbers, number]),
+    )
