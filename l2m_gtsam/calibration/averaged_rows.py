@@ -30,6 +30,8 @@ from l2m_gtsam.solve.robust import MEDIAN
 WIDE = np.array([1.0] * 3 + [1.0] * 9 + [100.0] * 3 + [1.0])
 LEVER_M = 0.3  # that a rotation counts with along the path
 FEWEST = 3  # readings of an average whose scatter is their noise
+NEAREST_M = 0.2  # of steel to a sensor
+NOISE_SIGMAS = 5.0  # of the length of three axes; noise alone is longer once in 20,000 readings
 MOST_SLOTS = 3000  # of a drive; longer ones are averaged over longer parts
 
 
@@ -78,7 +80,7 @@ def averaged(
     used: BoolArray,
     options: AveragingOptions,
 ) -> Averages:
-    """Return averages of readings inside the map, whether they counted or not.
+    """Return averages of readings inside the map, whether they counted or not, but for spikes.
 
     Parameters
     ----------
@@ -91,17 +93,47 @@ def averaged(
     options
         How far to average.
     """
+    lacking = lacking_field(readings, field_map, estimate)
+    kept = ~spikes(readings, lacking, estimate)
+    readings, used, lacking = readings.select(kept), used[kept], lacking[kept]
     slot = slots_of(readings, estimate, options.step_m)
     key = readings.sensor * (int(slot.max(initial=0)) + 1) + slot
     _, own, count = np.unique(key, return_inverse=True, return_counts=True)
     order = np.argsort(own, kind="stable")
     first = np.cumsum(count) - count
     middle = order[first + count // 2]
-    lacking = lacking_field(readings, field_map, estimate)
     mean = np.stack([np.bincount(own, axis) for axis in lacking.T], axis=1) / count[:, None]
     within = scatter(readings, lacking - mean[own], count[own])
     noise = np.maximum(within, estimate.noise)
     return Averages(readings[middle], slot[middle], mean, np.bincount(own, used) / count, noise)
+
+
+def spikes(readings: Readings, lacking: FloatArray, estimate: Estimate) -> BoolArray:
+    """Return which readings no steel explains: those before and after lack too little, shape (N,).
+
+    A dipole's field is m / r^3 to 2 m / r^3 long. Where its sensor has moved by d the distance is
+    r + d at most, so that at least half of (r / (r + d))^3 of it is left, and r is no less than
+    ``NEAREST_M``.
+
+    Parameters
+    ----------
+    readings
+        N of them, of each sensor in order of time.
+    lacking
+        What they have that the map has not, uT, shape (N, 3).
+    estimate
+        Of their sensors.
+    """
+    size, same = np.linalg.norm(lacking, axis=1), np.diff(readings.sensor) == 0
+    moved = np.linalg.norm(np.diff(places_of(readings, estimate.t), axis=0), axis=1)
+    left = 0.5 * (NEAREST_M / (NEAREST_M + moved)) ** 3
+    most = size + NOISE_SIGMAS * estimate.noise[readings.sensor]
+    beside = np.zeros((2, len(readings)), dtype=np.bool_)
+    beside[0, 1:] = same & (most[:-1] < left * size[1:])
+    beside[1, :-1] = same & (most[1:] < left * size[:-1])
+    # The first and the last reading of a sensor have one neighbour.
+    ends = ~np.stack([np.append(False, same), np.append(same, False)])
+    return np.asarray((beside | ends).all(axis=0) & beside.any(axis=0))
 
 
 def scatter(readings: Readings, deviation: FloatArray, count: IntArray) -> FloatArray:

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from l2m_gtsam.calibration.averaged_rows import Averages
+from l2m_gtsam.calibration.causes import REJECTED
 from l2m_gtsam.calibration.changed_places import (
     ChangesOptions,
     averaged_drive,
@@ -94,10 +96,22 @@ def shown_jumps(
     if not solution.budget.found and not len(suspected(drive, field_map, options.averaging)):
         return ()
     rows = drive.marginal(field_map, field_map, solution.budget, options.averaging)
-    shown = courses_of(rows, drive).records(drive.view.readings)
+    shown = courses_of(rows.without(single(drive.averages)), drive).records(drive.view.readings)
     jumps = [each for each in shown if isinstance(each, OffsetJump)]
     often = Counter(each.sensor for each in jumps)
     return tuple(each for each in jumps if often[each.sensor] < MOST_JUMPS)
+
+
+def single(averages: Averages) -> list[int]:
+    """Return the rejected averages before and after which those of the sensor counted.
+
+    One that is far off explains more than a jump does; of a jump many are rejected, or none.
+    """
+    order = np.lexsort((averages.readings.stamp_ns, averages.readings.sensor))
+    wrong, sensor = averages.counted[order] < REJECTED, averages.readings.sensor[order]
+    beside = wrong[1:] & wrong[:-1] & (np.diff(sensor) == 0)
+    alone = wrong & ~np.append(False, beside) & ~np.append(beside, False)
+    return [int(each) for each in order[alone]]
 
 
 def _solved_beside(

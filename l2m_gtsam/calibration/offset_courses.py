@@ -20,7 +20,7 @@ from l2m_gtsam.records.error_budget import MOST_JUMPS, OffsetDrift, OffsetJump
 
 AXES = 3
 MOMENTS = 40  # at which a jump is tried at once
-FEWEST = 5  # averages of the sensor before it, and after
+FEWEST = 20  # averages of the sensor before it, and after: what is shorter is a stretch
 ANYTHING_UT = 100.0  # standard deviation of a jump or a drift before readings
 Course = OffsetJump | OffsetDrift
 
@@ -132,9 +132,10 @@ def _candidates(
 ) -> Iterator[tuple[float, FoundCourse]]:
     """Yield the best jump and the drift of each sensor, with what it explains beyond its price."""
     for sensor, own in offsets.items():
-        jumps = [each.stamp_ns is not None for each in found if each.sensor == sensor]
-        tried = [_jump(rows, drive, own, sensor)] if sum(jumps) < MOST_JUMPS else []
-        if all(jumps):
+        before = [each.stamp_ns for each in found if each.sensor == sensor]
+        jumps = [stamp for stamp in before if stamp is not None]
+        tried = [_jump(rows, drive, own, sensor, jumps)] if len(jumps) < MOST_JUMPS else []
+        if len(jumps) == len(before):
             tried.append(_drift(rows, drive, own, sensor))
         for gain, course in tried:
             if course is not None:
@@ -142,11 +143,20 @@ def _candidates(
 
 
 def _jump(
-    rows: MarginalRows, drive: AveragedDrive, own: FloatArray, sensor: int
+    rows: MarginalRows,
+    drive: AveragedDrive,
+    own: FloatArray,
+    sensor: int,
+    before: Sequence[int],
 ) -> tuple[float, FoundCourse | None]:
-    """Return the jump of a sensor that explains most: at some moments, then between two."""
+    """Return the jump of a sensor that explains most: at some moments, then between two.
+
+    ``before`` are the stamps of jumps that it has already.
+    """
     stamps = np.sort(drive.view.readings.stamp_ns[drive.view.readings.sensor == sensor])
-    stamps = stamps[FEWEST : -FEWEST or None]
+    ends = np.array([0, len(stamps), *np.searchsorted(stamps, before)])
+    apart = np.abs(np.arange(len(stamps))[:, None] - ends).min(axis=1)
+    stamps = stamps[apart >= FEWEST]
     if not len(stamps):
         return 0.0, None
     at = np.arange(len(stamps))
