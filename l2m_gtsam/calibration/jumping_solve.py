@@ -173,4 +173,9 @@ def _settled(jumps: Sequence[OffsetJump], before: Sequence[OffsetJump]) -> bool:
 
 
 def _sigmas(change: ArrayLike, sigma: ArrayLike) -> float:
-    return float(np.linalg.norm(np.divide(change, sigma)))
+    """Return how many sigmas long a change is; none along axes of which readings say nothing.
+
+    The sigma of these is zero: of readings on one side of a jump none is used.
+    """
+    known = np.asarray(sigma) > 0
+    return float(np.linalg.norm(np.divide(change, sigma, out=np.zeros(3), where=known)))
