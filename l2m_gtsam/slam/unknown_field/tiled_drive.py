@@ -209,7 +209,7 @@ class TiledDrive:
         # A share above 1 is due to poses that have not converged, not to noise.
         return tuple(each.scaled(min(noise_share, 1.0)) for each in whole)
 
-    def graph(
+    def graphs(
         self,
         motions: RelativeMotions,
         penalties: tuple[ComplexityPenalty, ...],
@@ -218,8 +218,8 @@ class TiledDrive:
         chosen: IntArray,
         fixed: Calibrations | None,
         slow: SlowErrors | None = None,
-    ) -> gtsam.NonlinearFactorGraph:
-        """Return the factors of readings, and the prior of the tiles' weights.
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.NonlinearFactorGraph]:
+        """Return the factors of readings with the prior of the tiles' weights, and the penalties'.
 
         Parameters
         ----------
@@ -238,7 +238,8 @@ class TiledDrive:
         slow
             Slow errors of the readings, which are variables then.
         """
-        graph, motions = gtsam.NonlinearFactorGraph(), motions.without(self.brought)
+        graph, doubts = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+        motions = motions.without(self.brought)
         for tile, penalty in zip(self.tiles, penalties, strict=True):
             rows = np.intersect1d(tile.rows, chosen)
             graph.push_back(unit_priors({M(tile.number): len(tile.field)}))
@@ -246,7 +247,7 @@ class TiledDrive:
                 readings = motions.readings[rows]
                 batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
                 for together in successive(batch.key_poses):
-                    residuals = []
+                    residuals, doubtful = [], []
                     for k in together:
                         own = rows[batch.rows_of(k)]
                         lasting, left = (None, None) if slow is None else slow.of(k, own)
@@ -254,8 +255,10 @@ class TiledDrive:
                         step = motions.step_error(own, by_lidar[own])
                         residuals.append(tile_residual(batch, k, white, step, lasting))
                         doubt = effective_parameters(batch, k, penalty[batch.rows_of(k)])
-                        residuals += [] if doubt is None else [doubt]
+                        doubtful += [] if doubt is None else [doubt]
                     graph.add(joint_residual(residuals).factor())
+                    if doubtful:
+                        doubts.add(joint_residual(doubtful).factor())
         if slow is not None:
             graph.push_back(slow.graph())
-        return graph
+        return graph, doubts

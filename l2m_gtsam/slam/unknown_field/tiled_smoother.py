@@ -86,7 +86,12 @@ class FieldSolution:
 
 @dataclass(frozen=True)
 class TiledRound:
-    """The solution of one stage, with its tiles and graph."""
+    """The solution of one stage, with its tiles and the graph of what was measured.
+
+    The complexity penalty is not in that graph. It has the right gradient, but is no measurement:
+    the number of effective parameters is nearly linear in the positions, and the curvature of its
+    squared residuals would count as information about them.
+    """
 
     tiled: TiledDrive
     graph: gtsam.NonlinearFactorGraph
@@ -161,7 +166,7 @@ class TiledProblem:
             own = predicted.prediction.whitening(self._slow.white * noise)
             values.insert(self._slow.values())
         W, by_lidar = own * np.sqrt(weights)[:, None, None], predicted.prediction.by_lidar
-        graph = tiled.graph(motions, penalties, W, by_lidar, chosen, fixed, self._slow)
+        graph, doubts = tiled.graphs(motions, penalties, W, by_lidar, chosen, fixed, self._slow)
         graph.push_back(self._odometry)
         graph.push_back(self._links)
         if self._free:
@@ -169,7 +174,8 @@ class TiledProblem:
             values.insert(calibration_values(sensors))
         order = self._ordering(graph, values)
         limit, close = self._options.max_iterations, self._close
-        end = levenberg_marquardt(graph, values, order, limit, close)
+        doubts.push_back(graph)
+        end = levenberg_marquardt(doubts, values, order, limit, close)
         found = poses_in(end.values, len(poses))
         after = sensors_in(end.values, sensors)
         return TiledRound(tiled, graph, weights, end.values, found, after, end.ending)
