@@ -65,7 +65,7 @@ def test_on_line_poses_err_as_much_as_they_say() -> None:
 
 @pytest.mark.study
 def test_off_line_poses_err_as_much_as_they_say() -> None:
-    """7.0 +- 0.5, sigmas of 7 cm."""
+    """6.6 +- 0.5, sigmas of 7 cm."""
     found = []
     for seed in range(DRIVES):
         drawn = path(seed)

@@ -37,11 +37,10 @@ MISSED_WITHOUT = {
     (3, Drift.SLIP): "NEES 0.7",
     (4, Drift.SLIP): "NEES 1.4",
     (1, Drift.WALK): "doubt of 6 %",
-    (2, Drift.WALK): "49 % of 194 mm removed",
+    (2, Drift.WALK): "doubt of 7 %",
     (3, Drift.WALK): "18 % of 116 mm removed",
-    (4, Drift.WALK): "98 mm become 132 mm",
+    (4, Drift.WALK): "doubt of 6 %",
 }
-WORSE_WITHOUT = {(4, Drift.WALK): "98 mm become 132 mm, with a doubt of 3 % and a NEES of 8.8"}
 
 
 @cache
@@ -125,11 +124,8 @@ def test_without_a_map(without_map: Solved, request: pytest.FixtureRequest) -> N
 
 
 @pytest.mark.study
-def test_it_is_never_worse_than_odometry_without_saying_so(
-    without_map: Solved, request: pytest.FixtureRequest
-) -> None:
+def test_it_is_never_worse_than_odometry_without_saying_so(without_map: Solved) -> None:
     """Either poses are nearer to the truth, or they are odometry's, and the result says why."""
-    expect(request, WORSE_WITHOUT.get((without_map.run, without_map.kind)))
     result = without_map.result
     assert result.gain is not None
     if result.gain.shown:
