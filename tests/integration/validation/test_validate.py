@@ -31,7 +31,8 @@ from l2m_gtsam.studies.validation.drives import (
     calibrated_hall,
     changed_drive,
 )
-from l2m_gtsam.validation.validate import joint_covariance, validate
+from l2m_gtsam.validation.drive_test import joint_covariance
+from l2m_gtsam.validation.validate import validate
 from tests.drives.calibrations import unsolved
 from tests.drives.degenerate import STRONG
 from tests.drives.validation import MAP, OPTIONS, calibrated, changed, loops, other_drive
