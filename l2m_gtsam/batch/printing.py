@@ -56,6 +56,7 @@ def _run(browser: str, profile: str, page: Path, pdf: Path) -> str:
         *("--no-pdf-header-footer", f"--print-to-pdf={pdf}", page.resolve().as_uri()),
     ]
     try:
+        # The command is a browser that was found by name, and a page of ours.
         run = subprocess.run(command, capture_output=True, check=False, timeout=TIMEOUT_S)  # noqa: S603
     except subprocess.TimeoutExpired:
         return f" within {TIMEOUT_S} s"

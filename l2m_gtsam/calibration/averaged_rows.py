@@ -30,7 +30,6 @@ from l2m_gtsam.solve.robust import MEDIAN
 WIDE = np.array([1.0] * 3 + [1.0] * 9 + [100.0] * 3 + [1.0])
 LEVER_M = 0.3  # that a rotation counts with along the path
 FEWEST = 3  # readings of an average whose scatter is their noise
-NEAREST_M = 0.2  # of steel to a sensor
 NOISE_SIGMAS = 5.0  # of the length of three axes; noise alone is longer once in 20,000 readings
 MOST_SLOTS = 3000  # of a drive; longer ones are averaged over longer parts
 
@@ -79,6 +78,7 @@ def averaged(
     estimate: Estimate,
     used: BoolArray,
     options: AveragingOptions,
+    nearest: float,
 ) -> Averages:
     """Return averages of readings inside the map, whether they counted or not, but for spikes.
 
@@ -92,9 +92,11 @@ def averaged(
         Which of them counted, shape (M,).
     options
         How far to average.
+    nearest
+        Steel is no nearer to a sensor than this, metres.
     """
     lacking = lacking_field(readings, field_map, estimate)
-    kept = ~spikes(readings, lacking, estimate)
+    kept = ~spikes(readings, lacking, estimate, nearest)
     readings, used, lacking = readings.select(kept), used[kept], lacking[kept]
     slot = slots_of(readings, estimate, options.step_m)
     key = readings.sensor * (int(slot.max(initial=0)) + 1) + slot
@@ -108,12 +110,14 @@ def averaged(
     return Averages(readings[middle], slot[middle], mean, np.bincount(own, used) / count, noise)
 
 
-def spikes(readings: Readings, lacking: FloatArray, estimate: Estimate) -> BoolArray:
+def spikes(
+    readings: Readings, lacking: FloatArray, estimate: Estimate, nearest: float
+) -> BoolArray:
     """Return which readings no steel explains: those before and after lack too little, shape (N,).
 
     A dipole's field is m / r^3 to 2 m / r^3 long. Where its sensor has moved by d the distance is
     r + d at most, so that at least half of (r / (r + d))^3 of it is left, and r is no less than
-    ``NEAREST_M``.
+    ``nearest``.
 
     Parameters
     ----------
@@ -123,10 +127,12 @@ def spikes(readings: Readings, lacking: FloatArray, estimate: Estimate) -> BoolA
         What they have that the map has not, uT, shape (N, 3).
     estimate
         Of their sensors.
+    nearest
+        In metres.
     """
     size, same = np.linalg.norm(lacking, axis=1), np.diff(readings.sensor) == 0
     moved = np.linalg.norm(np.diff(places_of(readings, estimate.t), axis=0), axis=1)
-    left = 0.5 * (NEAREST_M / (NEAREST_M + moved)) ** 3
+    left = 0.5 * (nearest / (nearest + moved)) ** 3
     most = size + NOISE_SIGMAS * estimate.noise[readings.sensor]
     beside = np.zeros((2, len(readings)), dtype=np.bool_)
     beside[0, 1:] = same & (most[:-1] < left * size[1:])

@@ -75,13 +75,14 @@ def averaged_drive(
     solution: OneKeySolution,
     sensors: Sequence[int],
     field_map: QueryableMap,
-    options: AveragingOptions,
+    options: ChangesOptions,
 ) -> AveragedDrive:
     """Return averages of readings of solved sensors inside the map, rejected ones among them."""
     inside = solution.inside & np.isin(solution.readings.sensor, sensors)
     readings = solution.readings.select(inside)
     estimate = solution.estimate
-    averages = averaged(readings, field_map, estimate, solution.used[inside], options)
+    used, nearest = solution.used[inside], options.sources.nearest
+    averages = averaged(readings, field_map, estimate, used, options.averaging, nearest)
     return AveragedDrive.of(averages, field_map, estimate)
 
 
@@ -153,7 +154,7 @@ def search(
     sensors = tuple(each for each in solution.placed if whole[each])
     if not sensors or not is_place_of(field_map):
         return None
-    drive = averaged_drive(solution, sensors, field_map, options.averaging)
+    drive = averaged_drive(solution, sensors, field_map, options)
     places = suspected(drive, field_map, options.averaging)
     if not len(places) and known is None:
         return None

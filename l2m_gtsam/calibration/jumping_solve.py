@@ -92,7 +92,7 @@ def shown_jumps(
         return ()
     if not is_place_of(field_map):
         return ()
-    drive = averaged_drive(solution, solution.placed, field_map, options.averaging)
+    drive = averaged_drive(solution, solution.placed, field_map, options)
     if not solution.budget.found and not len(suspected(drive, field_map, options.averaging)):
         return ()
     rows = drive.marginal(field_map, field_map, solution.budget, options.averaging)

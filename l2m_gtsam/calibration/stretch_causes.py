@@ -61,7 +61,7 @@ def with_causes(
     if solution.contradicted:
         return stretches
     solved = [each.sensor for each in solution.solved]
-    drive = averaged_drive(solution, solved, field_map, options.averaging)
+    drive = averaged_drive(solution, solved, field_map, options)
     rows = drive.marginal(field_map, field_map, solution.budget, options.averaging)
     places = DisagreeingPlaces.of(rows, drive)
     return tuple(replace(each, explanations=places.explanations(each)) for each in stretches)

@@ -84,7 +84,8 @@ def seen_sources(
     """
     estimate = estimate_of(known, field_map.learnt.hyperparameters.noise)
     every = np.ones(len(readings), dtype=np.bool_)
-    averages = averaged(readings, field_map, estimate, every, options.averaging)
+    nearest = options.sources.nearest
+    averages = averaged(readings, field_map, estimate, every, options.averaging, nearest)
     drive = AveragedDrive.of(averages, field_map, estimate)
     places = suspected(drive, field_map, options.averaging)
     # What a map misses that does not know its own errors is no change.

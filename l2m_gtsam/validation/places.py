@@ -199,7 +199,8 @@ class AveragedBesideMap:
             How to look for sources.
         """
         every = np.ones(len(readings), dtype=np.bool_)
-        averages = averaged(readings, field_map, estimate, every, options.averaging)
+        nearest = options.sources.nearest
+        averages = averaged(readings, field_map, estimate, every, options.averaging, nearest)
         drive = AveragedDrive.of(averages, field_map, estimate)
         return cls(drive, suspected(drive, field_map, options.averaging), field_map, options)
 

@@ -6,12 +6,13 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2m_gtsam.calibration.averaged_rows import NEAREST_M, spikes
+from l2m_gtsam.calibration.averaged_rows import spikes
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
 
 NOISE_UT = 0.1
+NEAREST_M = 0.2
 STEP_M = 0.05
 
 
@@ -28,7 +29,7 @@ def along_a_line(count: int, step_m: float) -> Readings:
 def shown(readings: Readings, lacking: FloatArray) -> list[int]:
     ideal = np.tile(np.append(np.eye(3).ravel(), np.zeros(3)), (2, 1))
     estimate = Estimate(np.zeros((2, 3)), ideal, np.full(2, NOISE_UT), np.zeros(2), np.zeros(2))
-    return np.flatnonzero(spikes(readings, lacking, estimate)).tolist()
+    return np.flatnonzero(spikes(readings, lacking, estimate, NEAREST_M)).tolist()
 
 
 def test_single_spikes_are_found_also_at_the_ends() -> None:
