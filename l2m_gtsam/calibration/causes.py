@@ -95,16 +95,16 @@ def explanations(
     by_sensor = np.stack([sensor == s for s in np.unique(sensor)], axis=1)
     offsets = sensor_offsets(drive) * (passage >= 0)[:, None, None]
     pulled, _ = rows.pull(residual)
-    per_passage = _gains(rows, field[:, :, None] * by_passage[:, None], pulled, 1)
-    per_sensor = _gains(rows, field[:, :, None] * by_sensor[:, None], pulled, 1)
-    own_offset = _gains(rows, offsets, pulled, 3)
+    per_passage = gains(rows, field[:, :, None] * by_passage[:, None], pulled, 1)
+    per_sensor = gains(rows, field[:, :, None] * by_sensor[:, None], pulled, 1)
+    own_offset = gains(rows, offsets, pulled, 3)
     size = float(np.sqrt(np.mean(np.sum(field[passage >= 0] ** 2, axis=1))))
     one = price(rows, 1)
-    place = float(_gains(rows, field[:, :, None], pulled, 1)[0]) - one
+    place = float(gains(rows, field[:, :, None], pulled, 1)[0]) - one
     moment = float(per_passage.max() - one - 2 * np.log(len(per_passage)))
     alone = max(float(per_sensor.max()) - one, float(own_offset.max()) - 3 * one)
     width = offsets.shape[2]
-    vehicle = float(_gains(rows, offsets, pulled, width)[0]) - width * one
+    vehicle = float(gains(rows, offsets, pulled, width)[0]) - width * one
     found = [
         CauseGain(Cause.PLACE, place, size),
         CauseGain(Cause.MOMENT, moment, size),
@@ -134,7 +134,7 @@ def _offsets_explain(rows: MarginalRows, drive: AveragedDrive, on: BoolArray) ->
     features = sensor_offsets(drive) * on[:, None, None]
     pulled, _ = rows.pull(rows.residual)
     width = features.shape[2]
-    return float(_gains(rows, features, pulled, width)[0]) - price(rows, width)
+    return float(gains(rows, features, pulled, width)[0]) - price(rows, width)
 
 
 def sensor_offsets(drive: AveragedDrive) -> FloatArray:
@@ -147,12 +147,27 @@ def sensor_offsets(drive: AveragedDrive) -> FloatArray:
     return np.asarray(offsets[:, :, present].reshape(len(readings), 3, -1))
 
 
-def _gains(rows: MarginalRows, features: FloatArray, pulled: FloatArray, width: int) -> FloatArray:
-    """Return what so many columns of features together explain, group by group."""
+def gains(rows: MarginalRows, features: FloatArray, pulled: FloatArray, width: int) -> FloatArray:
+    """Return what so many columns of fields together explain, group by group.
+
+    Parameters
+    ----------
+    rows
+        Averaged readings, N of them.
+    features
+        Fields per unit, G groups of ``width``, shape (N, 3, G width).
+    pulled
+        The precision times what they have to explain, shape (N, 3).
+
+    Returns
+    -------
+    numpy.ndarray
+        Twice the logarithm of each group's likelihood ratio, if it may be of any strength, (G,).
+    """
     F, g = rows.information(features), np.einsum("nim,ni->m", features, pulled)
-    gains = []
+    found = []
     for first in range(0, len(g), width):
         own = slice(first, first + width)
         x, *_ = np.linalg.lstsq(F[own, own], g[own], rcond=1e-10)
-        gains.append(float(g[own] @ x))
-    return np.array(gains)
+        found.append(float(g[own] @ x))
+    return np.array(found)

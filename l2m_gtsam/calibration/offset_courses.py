@@ -8,12 +8,13 @@ sensors free, and stand first if they explain more of them.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive
-from l2m_gtsam.calibration.causes import sensor_offsets
-from l2m_gtsam.data import FloatArray, IntArray, Readings
+from l2m_gtsam.calibration.causes import gains, sensor_offsets
+from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.sources.found_sources import price
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.records.error_budget import MOST_JUMPS, OffsetDrift, OffsetJump
@@ -104,14 +105,13 @@ def courses_of(rows: MarginalRows, drive: AveragedDrive) -> FoundCourses:
     """
     present, each = np.unique(drive.view.readings.sensor).tolist(), sensor_offsets(drive)
     offsets = dict(zip(present, np.split(each, len(present), axis=2), strict=True))
-    found, beside = list[FoundCourse](), rows
+    found, search = list[FoundCourse](), CourseSearch(rows, drive.view.readings, offsets)
     while True:
-        tried = list(_candidates(beside, drive, offsets, found))
-        net, best = max(tried, key=lambda each: each[0], default=(-np.inf, None))
+        net, best = max(search.each(found), key=lambda each: each[0], default=(-np.inf, None))
         if best is None or net < 0:
             break
         found.append(best)
-        beside = beside.beside(best.features, ANYTHING_UT)
+        search = replace(search, rows=search.rows.beside(best.features, ANYTHING_UT))
     return _needed(rows, _estimated(rows, found))
 
 
@@ -124,79 +124,77 @@ def _needed(rows: MarginalRows, found: FoundCourses) -> FoundCourses:
     return _needed(rows, best) if best.gain > found.gain else found
 
 
-def _candidates(
-    rows: MarginalRows,
-    drive: AveragedDrive,
-    offsets: Mapping[int, FloatArray],
-    found: Sequence[FoundCourse],
-) -> Iterator[tuple[float, FoundCourse]]:
-    """Yield the best jump and the drift of each sensor, with what it explains beyond its price."""
-    for sensor, own in offsets.items():
-        before = [each.stamp_ns for each in found if each.sensor == sensor]
-        jumps = [stamp for stamp in before if stamp is not None]
-        tried = [_jump(rows, drive, own, sensor, jumps)] if len(jumps) < MOST_JUMPS else []
-        if len(jumps) == len(before):
-            tried.append(_drift(rows, drive, own, sensor))
-        for gain, course in tried:
-            if course is not None:
-                yield gain - price(rows, course.parameters), course
+@dataclass(frozen=True)
+class CourseSearch:
+    """Where a jump or a drift is looked for.
 
-
-def _jump(
-    rows: MarginalRows,
-    drive: AveragedDrive,
-    own: FloatArray,
-    sensor: int,
-    before: Sequence[int],
-) -> tuple[float, FoundCourse | None]:
-    """Return the jump of a sensor that explains most: at some moments, then between two.
-
-    ``before`` are the stamps of jumps that it has already.
+    Attributes
+    ----------
+    rows, readings
+        The averaged readings, N of them, beside what was found before.
+    offsets
+        By sensor what H does to averages per uT along its axes, map frame, shape (N, 3, 3).
     """
-    stamps = np.sort(drive.view.readings.stamp_ns[drive.view.readings.sensor == sensor])
-    ends = np.array([0, len(stamps), *np.searchsorted(stamps, before)])
-    apart = np.abs(np.arange(len(stamps))[:, None] - ends).min(axis=1)
-    stamps = stamps[apart >= FEWEST]
-    if not len(stamps):
-        return 0.0, None
-    at = np.arange(len(stamps))
-    while True:
-        few = at[np.unique(np.linspace(0, len(at) - 1, MOMENTS).astype(int))]
-        gains, features = _gains(rows, drive, own, stamps[few])
-        best = int(np.argmax(gains))
-        if len(few) == len(at):
-            jump = FoundCourse(sensor, int(stamps[few[best]]), features[best])
-            return float(gains[best]), jump
-        at = np.arange(few[max(best - 1, 0)], few[min(best + 1, len(few) - 1)] + 1)
 
+    rows: MarginalRows
+    readings: Readings
+    offsets: Mapping[int, FloatArray]
 
-def _drift(
-    rows: MarginalRows, drive: AveragedDrive, own: FloatArray, sensor: int
-) -> tuple[float, FoundCourse | None]:
-    """Return the steady drift of a sensor."""
-    stamp_ns = drive.view.readings.stamp_ns
-    seconds = 1e-9 * (stamp_ns - stamp_ns.min())
-    if not seconds.any():
-        return 0.0, None
-    features = own * (seconds / seconds.max())[:, None, None]
-    pulled, _ = rows.pull(rows.residual)
-    return _gain(rows, pulled, features), FoundCourse(sensor, None, features)
+    def each(self, found: Sequence[FoundCourse]) -> Iterator[tuple[float, FoundCourse]]:
+        """Yield the best jump and the drift of each sensor, and first what each explains net.
 
+        A sensor drifts once, and jumps a few times, beside what was ``found`` of it.
+        """
+        for sensor in self.offsets:
+            before = [each.stamp_ns for each in found if each.sensor == sensor]
+            jumps = [stamp for stamp in before if stamp is not None]
+            tried = [self.jump(sensor, jumps)] if len(jumps) < MOST_JUMPS else []
+            if len(jumps) == len(before):
+                tried.append(self.drift(sensor))
+            for gain, course in tried:
+                if course is not None:
+                    yield gain - price(self.rows, course.parameters), course
 
-def _gains(
-    rows: MarginalRows, drive: AveragedDrive, own: FloatArray, stamps: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return what jumps at M moments explain each, (M,), and what they do, (M, N, 3, 3)."""
-    after = drive.view.readings.stamp_ns >= stamps[:, None]
-    features = own * after[:, :, None, None]
-    pulled, _ = rows.pull(rows.residual)
-    return np.array([_gain(rows, pulled, each) for each in features]), features
+    def jump(self, sensor: int, before: Sequence[int]) -> tuple[float, FoundCourse | None]:
+        """Return the jump of a sensor that explains most: at some moments, then between two.
 
+        ``before`` are the stamps of jumps that it has already.
+        """
+        own, stamp_ns = self.offsets[sensor], self.readings.stamp_ns
+        stamps = np.sort(stamp_ns[self.readings.sensor == sensor])
+        ends = np.array([0, len(stamps), *np.searchsorted(stamps, before)])
+        apart = np.abs(np.arange(len(stamps))[:, None] - ends).min(axis=1)
+        stamps = stamps[apart >= FEWEST]
+        if not len(stamps):
+            return 0.0, None
+        at = np.arange(len(stamps))
+        while True:
+            few = at[np.unique(np.linspace(0, len(at) - 1, MOMENTS).astype(int))]
+            after = stamp_ns[:, None] >= stamps[few]
+            features = own[:, :, None, :] * after[:, None, :, None]
+            gain = self._gains(features.reshape(len(own), AXES, -1))
+            best = int(np.argmax(gain))
+            if len(few) == len(at):
+                jump = FoundCourse(sensor, int(stamps[few[best]]), features[:, :, best])
+                return float(gain[best]), jump
+            at = np.arange(few[max(best - 1, 0)], few[min(best + 1, len(few) - 1)] + 1)
 
-def _gain(rows: MarginalRows, pulled: FloatArray, features: FloatArray) -> float:
-    """Return what a course explains, if H may follow it by anything."""
-    pull = np.einsum("ni,nij->j", pulled, features)
-    return float(pull @ np.linalg.lstsq(rows.information(features), pull, rcond=1e-10)[0])
+    def drift(self, sensor: int) -> tuple[float, FoundCourse | None]:
+        """Return the steady drift of a sensor."""
+        stamp_ns = self.readings.stamp_ns
+        seconds = 1e-9 * (stamp_ns - stamp_ns.min())
+        if not seconds.any():
+            return 0.0, None
+        features = self.offsets[sensor] * (seconds / seconds.max())[:, None, None]
+        return float(self._gains(features)[0]), FoundCourse(sensor, None, features)
+
+    def _gains(self, features: FloatArray) -> FloatArray:
+        """Return what courses explain each, if H may follow them by anything."""
+        return gains(self.rows, features, self._pulled, AXES)
+
+    @cached_property
+    def _pulled(self) -> FloatArray:
+        return self.rows.pull(self.rows.residual)[0]
 
 
 def _estimated(rows: MarginalRows, found: Sequence[FoundCourse]) -> FoundCourses:

@@ -9,27 +9,16 @@ from l2m_gtsam.calibration.calibrate import prepare
 from l2m_gtsam.calibration.offset_courses import ANYTHING_UT, Course, without_course
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
-from l2m_gtsam.data import (
-    FloatArray,
-    Readings,
-    Recording,
-    SaturatedAxis,
-)
+from l2m_gtsam.data import FloatArray, Readings, Recording, SaturatedAxis
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST
 from l2m_gtsam.recording.saturation import saturation_sentence
 from l2m_gtsam.recording.sync import stuck_sensors
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.error_budget import ErrorCause
-from l2m_gtsam.records.validation import (
-    CalibrationPart,
-    NotValidated,
-    ValidatedSensor,
-)
+from l2m_gtsam.records.validation import NotValidated, ValidatedSensor
 from l2m_gtsam.solve.correction import without_moving
-from l2m_gtsam.validation.displacement import (
-    SensorsOnDrive,
-)
+from l2m_gtsam.validation.displacement import SensorsOnDrive
 from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
 from l2m_gtsam.validation.innovation import KnownCalibration
 from l2m_gtsam.validation.recheck import SensorDrive, finite, recheck
@@ -221,21 +210,3 @@ def alike_share(sensor: SensorCalibration) -> float:
     """
     own = [each for each in sensor.variance_shares if each.cause is ErrorCause.NOISE]
     return 1 - min((share for each in own for share in (each.t, each.C, each.H)), default=0.0)
-
-
-def parts_of(found: ValidatedSensor | NotValidated) -> tuple[CalibrationPart, ...]:
-    """Return the parts of a sensor that have changed."""
-    return tuple(e.part for e in found.changes) if isinstance(found, ValidatedSensor) else ()
-
-
-def tests_in(found: Sequence[ValidatedSensor | NotValidated]) -> list[ValidatedSensor]:
-    """Return what was found of sensors that could be tested."""
-    return [each for each in found if isinstance(each, ValidatedSensor)]
-
-
-def testable(
-    known: Sequence[SensorCalibration], found: Sequence[ValidatedSensor | NotValidated]
-) -> list[SensorCalibration]:
-    """Return the sensors that could be tested."""
-    pairs = zip(known, found, strict=True)
-    return [one for one, each in pairs if isinstance(each, ValidatedSensor)]

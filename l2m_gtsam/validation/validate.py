@@ -2,19 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
-from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import (
-    FloatArray,
-    Readings,
-    Recording,
-    SourceFile,
-    same_content,
-)
+from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile, same_content
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import check_frame
 from l2m_gtsam.maps.sources.changed_map import ChangedMap
@@ -30,34 +24,24 @@ from l2m_gtsam.records.validation import (
     Displacement,
     DriveValidation,
     NotValidated,
-    ValidatedSensor,
 )
 from l2m_gtsam.validation.displacement import (
     DisplacementTest,
     ExplainedDrive,
     common_displacement,
 )
-from l2m_gtsam.validation.drive_test import (
-    DriveTest,
-    drive_test,
-    joint_covariance,
-    parts_of,
-    testable,
-    tested,
-    tests_in,
-)
+from l2m_gtsam.validation.drive_test import drive_test, joint_covariance
 from l2m_gtsam.validation.exchange import TestedSensor, exchanged
-from l2m_gtsam.validation.figures import doubts_and_notes, offset_s
-from l2m_gtsam.validation.innovation import estimate_of, together
+from l2m_gtsam.validation.figures import doubts_and_notes
 from l2m_gtsam.validation.places import (
-    AveragedBesideMap,
     PlaceOrVehicle,
     is_elsewhere,
     is_searched,
     spread,
     who_changed,
 )
-from l2m_gtsam.validation.recheck import finite, inside, usable
+from l2m_gtsam.validation.recheck import finite
+from l2m_gtsam.validation.tested_drive import TestedDrive, parts_of
 
 OF_PLACE = {CalibrationPart.PLACE, CalibrationPart.ROTATION}  # that a displacement changes
 NO_STEEL = "the readings show no steel that came or went"
@@ -115,197 +99,127 @@ def validate(
     if not known:
         raise CalibrationError(nothing_shared(recording, calibration, missing))
     test = drive_test(recording, field_map, known, options, chance)
-    surveyed, found = field_map, list[ValidatedSensor | NotValidated]()
-    for index, sensor in enumerate(known):
-        progress("validating", index / len(known))
-        found.append(tested(test, sensor))
-    test, known, found = _as_exchanged(test, known, found)
-    shift_test = _test_of_shifts(test, known, found)
-    test, found, displacement = _beside_displacement(test, known, found, shift_test)
-    test, found = _beside_courses(test, known, found)
-    if displacement is None and test.courses:
-        again = _test_of_shifts(test, known, found)
-        test, found, displacement = _beside_displacement(test, known, found, again)
-    judged, beside = _judged(test, known, found)
-    if judged is not None and judged.best.of_place:
-        field_map, found = ChangedMap(field_map, judged.found), beside
+    drive = _as_exchanged(TestedDrive.of(test, known, progress))
+    shift_test = _test_of_shifts(drive)
+    drive, displacement = _beside_displacement(drive, shift_test)
+    drive = _beside_courses(drive)
+    if displacement is None and drive.test.courses:
+        drive, displacement = _beside_displacement(drive, _test_of_shifts(drive))
+    drive, judged = _beside_steel(drive)
     progress("validating", 1.0)
-    places = np.concatenate([_places(test.readings, each) for each in known])
-    doubts, notes = doubts_and_notes(surveyed, calibration, map_source)
+    doubts, notes = doubts_and_notes(field_map, calibration, map_source)
     if judged is not None:
         doubts = (judged.sentence, *doubts)
-    elif is_searched(test.field_map, options.changes) and any(map(parts_of, found)):
-        who = who_changed([each.sensor for each in known], [parts_of(each) for each in found])
+    elif is_searched(drive.test.field_map, options.changes) and drive.changed:
+        who = who_changed([each.sensor for each in drive.known], drive.parts)
         notes = (f"What changed is of {who}, not of the place: {NO_STEEL}.", *notes)
+    shown = field_map
+    if judged is not None and judged.best.of_place:
+        shown = ChangedMap(field_map, judged.found)
+    places = np.concatenate([_places(drive.test.readings, each) for each in drive.known])
+    courses = drive.test.courses
     return DriveValidation(
-        sensors=tuple(tests_in(found)),
-        missing=(*missing, *(each for each in found if isinstance(each, NotValidated))),
+        sensors=tuple(drive.sensors),
+        missing=(*missing, *drive.untested),
         drive=drive_metrics(recording),
-        picture=map_picture(field_map, places),
+        picture=map_picture(shown, places),
         doubts=doubts,
         notes=notes,
         sources=() if judged is None else judged.sources,
         explanations=() if judged is None else judged.explanations,
         displacement=displacement,
         detectable_shifts=() if shift_test is None else shift_test.detectable(chance),
-        jumps=tuple(each for each in test.courses if isinstance(each, OffsetJump)),
-        drifts=tuple(each for each in test.courses if isinstance(each, OffsetDrift)),
+        jumps=tuple(each for each in courses if isinstance(each, OffsetJump)),
+        drifts=tuple(each for each in courses if isinstance(each, OffsetDrift)),
     )
 
 
-def _as_exchanged(
-    test: DriveTest,
-    known: list[SensorCalibration],
-    found: list[ValidatedSensor | NotValidated],
-) -> tuple[DriveTest, list[SensorCalibration], list[ValidatedSensor | NotValidated]]:
-    """Return the calibrations that readings are of, and what is found with them."""
+def _as_exchanged(drive: TestedDrive) -> TestedDrive:
+    """Return a drive with the calibrations that readings are of."""
+    test = drive.test
     on_drive = [
         TestedSensor(test.drive_of(one), test.known(one), each)
-        for one, each in zip(known, found, strict=True)
-        if isinstance(each, ValidatedSensor)
+        for one, each in zip(drive.calibrations, drive.sensors, strict=True)
     ]
     theirs = exchanged(on_drive, test.field_map)
     if not theirs:
-        return test, known, found
-    of = {each.sensor: each for each in known}
-    test = replace(test, reads_as=theirs)
+        return drive
+    of = {each.sensor: each for each in drive.known}
     known = [replace(of[theirs.get(name, name)], sensor=name) for name in of]
-    return test, known, [tested(test, each) for each in known]
+    return TestedDrive.of(replace(test, reads_as=theirs), known)
 
 
-def _test_of_shifts(
-    test: DriveTest,
-    known: Sequence[SensorCalibration],
-    found: Sequence[ValidatedSensor | NotValidated],
-) -> DisplacementTest | None:
+def _test_of_shifts(drive: TestedDrive) -> DisplacementTest | None:
     """Return the test of displacements of all sensors together; none where there are none.
 
     What has changed of sensors and cannot be of a displacement is free in it.
     """
-    kept = testable(known, found)
-    if not kept:
+    if not drive.sensors:
         return None
-    sensors, parts = test.on_drive(kept), [parts_of(each) for each in tests_in(found)]
+    sensors = drive.test.on_drive(drive.calibrations)
     free = (
-        P + spread(one.distortion.C, tuple(part for part in own if part not in OF_PLACE))
-        for P, one, own in zip(sensors.spreads, kept, parts, strict=True)
+        P + spread(one.distortion.C, tuple(part for part in parts_of(each) if part not in OF_PLACE))
+        for P, one, each in zip(sensors.spreads, drive.calibrations, drive.sensors, strict=True)
     )
     return DisplacementTest.of(replace(sensors, spreads=tuple(free)))
 
 
 def _beside_displacement(
-    test: DriveTest,
-    known: Sequence[SensorCalibration],
-    found: list[ValidatedSensor | NotValidated],
-    shift_test: DisplacementTest | None,
-) -> tuple[DriveTest, list[ValidatedSensor | NotValidated], Displacement | None]:
-    """Return the displacement that sensors share, if they do, and what is found beside it."""
+    drive: TestedDrive, shift_test: DisplacementTest | None
+) -> tuple[TestedDrive, Displacement | None]:
+    """Return the displacement that sensors share, if they do, and the drive beside it."""
     if shift_test is None:
-        return test, found, None
-    sensors = test.on_drive(testable(known, found))
-    shared = common_displacement(
-        sensors, shift_test, test.chance, lambda: _others(test, known, found)
-    )
+        return drive, None
+    test = drive.test
+    sensors = test.on_drive(drive.calibrations)
+    shared = common_displacement(sensors, shift_test, test.chance, lambda: _others(drive))
     if shared is None:
-        return test, found, None
+        return drive, None
     by, record = shared
     poses = by.applied(test.recording.trajectory)
     displaced = replace(test, recording=replace(test.recording, trajectory=poses))
-    beside = [tested(displaced, each) for each in known]
-    return (test, found, None) if is_elsewhere(found, beside) else (displaced, beside, record)
+    beside = drive.beside(displaced)
+    return (drive, None) if is_elsewhere(drive.found, beside.found) else (beside, record)
 
 
-def _others(
-    test: DriveTest,
-    known: Sequence[SensorCalibration],
-    found: Sequence[ValidatedSensor | NotValidated],
-) -> list[ExplainedDrive]:
+def _others(drive: TestedDrive) -> list[ExplainedDrive]:
     """Return what explains readings beside a displacement: courses of H, and steel."""
-    kept, averages = testable(known, found), _averaged(test, known, found)
+    test, averages = drive.test, drive.averages
     if averages is None:
         return []
-    others = []
+    explained = []
     if averages.courses:
-        sensors = replace(test, courses=(*test.courses, *averages.courses)).on_drive(kept)
-        others.append(ExplainedDrive.by(sensors, averages.found_courses.parameters, test.chance))
+        courses = replace(test, courses=(*test.courses, *averages.courses))
+        explained.append((courses, averages.found_courses.parameters))
     if (shown := averages.shown) is not None:
-        changed = replace(test, field_map=ChangedMap(test.field_map, shown.found))
-        others.append(
-            ExplainedDrive.by(changed.on_drive(kept), shown.found.parameters, test.chance)
-        )
-    return others
-
-
-def _averaged(
-    test: DriveTest,
-    known: Sequence[SensorCalibration],
-    found: Sequence[ValidatedSensor | NotValidated],
-) -> AveragedBesideMap | None:
-    """Return the averaged drive if places are suspected on it, or sensors changed."""
-    kept = testable(known, found)
-    if not kept:
-        return None
-    readings, estimate = _of_all(test, kept)
-    averages = AveragedBesideMap.of(readings, test.field_map, estimate, test.options.changes)
-    return averages if len(averages.places) or any(map(parts_of, found)) else None
-
-
-def _beside_courses(
-    test: DriveTest,
-    known: Sequence[SensorCalibration],
-    found: list[ValidatedSensor | NotValidated],
-) -> tuple[DriveTest, list[ValidatedSensor | NotValidated]]:
-    """Return the test without jumps and drifts of H, and what is found then."""
-    averages = _averaged(test, known, found)
-    if averages is None or not averages.courses:
-        return test, found
-    without = replace(test, courses=averages.courses)
-    beside = [tested(without, each) for each in known]
-    return (test, found) if is_elsewhere(found, beside) else (without, beside)
-
-
-def _judged(
-    test: DriveTest,
-    known: Sequence[SensorCalibration],
-    found: Sequence[ValidatedSensor | NotValidated],
-) -> tuple[PlaceOrVehicle | None, list[ValidatedSensor | NotValidated]]:
-    """Return whether the place changed or the vehicle, and what is found if the place did."""
-    kept = testable(known, found)
-    averages = _averaged(test, known, found)
-    if averages is None or (shown := averages.shown) is None:
-        return None, []
-    changed = replace(test, field_map=ChangedMap(test.field_map, shown.found))
-    beside = [tested(changed, sensor) for sensor in known]
-    if is_elsewhere(found, beside):
-        return None, []
-    covariances = np.array([finite(joint_covariance(each), test.options.solve) for each in kept])
-    alone, besides = (
-        [parts_of(each) for one, each in zip(known, which, strict=True) if one in kept]
-        for which in (found, beside)
-    )
-    return shown.judged(covariances, alone, besides), beside
-
-
-def _of_all(test: DriveTest, known: Sequence[SensorCalibration]) -> tuple[Readings, Estimate]:
-    """Return the readings of sensors inside the map, and their calibrations.
-
-    Where steel is not looked for, without those that it may explain: it would look like jumps.
-    """
-    drives = [test.drive_of(each) for each in known]
-    calibrations = [test.known(each) for each in known]
-    searched = is_searched(test.field_map, test.options.changes)
-    counts = [
-        inside(drive, test.field_map, each)
-        if searched
-        else usable(drive, test.field_map, each, test.options.solve)
-        for drive, each in zip(drives, calibrations, strict=True)
+        steel = replace(test, field_map=ChangedMap(test.field_map, shown.found))
+        explained.append((steel, shown.found.parameters))
+    return [
+        ExplainedDrive.by(beside.on_drive(drive.calibrations), parameters, test.chance)
+        for beside, parameters in explained
     ]
-    vectors = np.array([each.vector for each in calibrations])
-    estimate = estimate_of(vectors, np.array([each.noise for each in calibrations]))
-    readings = together(
-        [drive.at(offset_s(each)) for drive, each in zip(drives, known, strict=True)]
-    )
-    return readings.select(np.concatenate(counts)), estimate
+
+
+def _beside_courses(drive: TestedDrive) -> TestedDrive:
+    """Return a drive without jumps and drifts of H."""
+    if drive.averages is None or not drive.averages.courses:
+        return drive
+    beside = drive.beside(replace(drive.test, courses=drive.averages.courses))
+    return drive if is_elsewhere(drive.found, beside.found) else beside
+
+
+def _beside_steel(drive: TestedDrive) -> tuple[TestedDrive, PlaceOrVehicle | None]:
+    """Return whether the place changed or the vehicle, and the drive beside steel if it did."""
+    test = drive.test
+    if drive.averages is None or (shown := drive.averages.shown) is None:
+        return drive, None
+    beside = drive.beside(replace(test, field_map=ChangedMap(test.field_map, shown.found)))
+    if is_elsewhere(drive.found, beside.found):
+        return drive, None
+    covariances = [finite(joint_covariance(e), test.options.solve) for e in drive.calibrations]
+    alone, besides = (list(compress(each.parts, drive.is_tested)) for each in (drive, beside))
+    judged = shown.judged(np.array(covariances), alone, besides)
+    return beside if judged.best.of_place else drive, judged
 
 
 def _places(readings: Readings, sensor: SensorCalibration) -> FloatArray:
