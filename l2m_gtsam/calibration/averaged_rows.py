@@ -24,6 +24,7 @@ from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.options import Options
 from l2m_gtsam.solve.linear_algebra import lower_information_root, right_divided
 from l2m_gtsam.solve.robust import MEDIAN
+from l2m_gtsam.solve.row_blocks import RowBlocks
 
 # What is known of a sensor's t, C row by row, H and time offset here: next to nothing, beside what
 # the readings of a drive determine.
@@ -256,7 +257,7 @@ class AveragedDrive:
             points=places_of(readings, self.estimate.t),
             residual=self.averages.residual,
             whitening=whitening,
-            nuisance=csr_array(whitening @ design),
+            nuisance=RowBlocks.of(whitening @ design),
             prior=prior,
             slot=self.averages.slot,
         )

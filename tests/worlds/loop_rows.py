@@ -6,6 +6,7 @@ from scipy.sparse import csr_array, eye_array
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.source import SourceShape
+from l2m_gtsam.solve.row_blocks import RowBlocks
 
 NOISE_UT = 0.1
 DIPOLE = SourceShape.dipole(np.array([1.0, 0.8, 0.5]), np.array([3.0, -2.0, 9.0]))
@@ -29,7 +30,7 @@ def rows_with(field: FloatArray, seed: int) -> MarginalRows:
         points=points,
         residual=field + noise + np.repeat([[3.0, -1.0, 2.0], [0.0, 5.0, -4.0]], 120, axis=0),
         whitening=white,
-        nuisance=csr_array(white @ offset),
+        nuisance=RowBlocks.of(np.asarray(offset / NOISE_UT)),
         prior=1e-4 * np.eye(6),
         slot=np.tile(np.arange(120), 2),
     )

@@ -15,9 +15,10 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag, cholesky, solve_triangular
-from scipy.sparse import csr_array, hstack
+from scipy.sparse import csr_array
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.solve.row_blocks import RowBlocks
 
 AXES = 3
 ANYTHING_UT = 1e4  # that a wrong reading may be off by
@@ -36,7 +37,7 @@ class MarginalRows:
     whitening
         V in 1/uT, block diagonal, shape (3 N, 3 N).
     nuisance
-        V X, shape (3 N, K).
+        V X, of 3 N rows and K columns.
     prior
         Information of n before any reading, shape (K, K).
     slot
@@ -46,7 +47,7 @@ class MarginalRows:
     points: FloatArray
     residual: FloatArray
     whitening: csr_array
-    nuisance: csr_array
+    nuisance: RowBlocks
     prior: FloatArray
     slot: IntArray
 
@@ -56,15 +57,15 @@ class MarginalRows:
     @cached_property
     def _root(self) -> tuple[FloatArray, FloatArray]:
         """Cholesky factor of the scaled information of n, and the scale."""
-        information = self.prior + (self.nuisance.T @ self.nuisance).toarray()
+        information = self.prior + self.nuisance.gram()
         scale = 1 / np.sqrt(np.diag(information))
         lower = cholesky(information * scale * scale[:, None], lower=True, check_finite=False)
         return lower, scale
 
-    def projected(self, white: FloatArray) -> FloatArray:
+    def projected(self, white: csr_array | FloatArray) -> FloatArray:
         """Return ``L^-1 X^T V^T`` times white columns, shape (3 N, M): (K, M)."""
         lower, scale = self._root
-        seen = scale[:, None] * (self.nuisance.T @ white)
+        seen = scale[:, None] * self.nuisance.transposed_times(white)
         return np.asarray(solve_triangular(lower, seen, lower=True, check_finite=False))
 
     def whitened(self, features: FloatArray) -> FloatArray:
@@ -94,12 +95,7 @@ class MarginalRows:
         if not len(readings):
             return self
         columns = (AXES * np.array(readings, dtype=int)[:, None] + np.arange(AXES)).ravel()
-        own = csr_array(self.whitening[:, columns])
-        return replace(
-            self,
-            nuisance=hstack([self.nuisance, own], format="csr"),
-            prior=block_diag(self.prior, ANYTHING_UT**-2 * np.eye(len(columns))),
-        )
+        return self._grown(csr_array(self.whitening[:, columns]), ANYTHING_UT)
 
     def beside(self, features: FloatArray, sigma: float) -> "MarginalRows":
         """Return the same beside fields of any strength.
@@ -111,11 +107,24 @@ class MarginalRows:
         sigma
             Standard deviation of each one's strength before readings.
         """
-        return replace(
-            self,
-            nuisance=hstack([self.nuisance, csr_array(self.whitened(features))], format="csr"),
-            prior=block_diag(self.prior, sigma**-2 * np.eye(features.shape[2])),
+        return self._grown(self.whitened(features), sigma)
+
+    def _grown(self, white: csr_array | FloatArray, sigma: float) -> "MarginalRows":
+        """Return the same with M more errors, white columns, shape (3 N, M), of this deviation."""
+        count = white.shape[1]
+        prior = sigma**-2 * np.eye(count)
+        grown = replace(
+            self, nuisance=self.nuisance.beside(white), prior=block_diag(self.prior, prior)
         )
+        # A root of the larger information is the one of before with rows below it.
+        (lower, scale), own = self._root, np.asarray(prior + white.T @ white)
+        units = 1 / np.sqrt(np.diag(own))
+        below = self.projected(white) * units
+        left = own * units * units[:, None] - below.T @ below
+        corner = cholesky(left, lower=True, check_finite=False)
+        whole = np.block([[lower, np.zeros((len(lower), count))], [below.T, corner]])
+        grown.__dict__["_root"] = whole, np.concatenate([scale, units])
+        return grown
 
     def near(self, keep: BoolArray) -> "MarginalRows":
         """Return the readings of all slots of which some are to be kept, (N,), as views.
@@ -130,7 +139,7 @@ class MarginalRows:
             points=self.points[at],
             residual=self.residual[at],
             whitening=self.whitening[rows][:, rows],
-            nuisance=self.nuisance[rows],
+            nuisance=self.nuisance.at(rows),
             slot=self.slot[at],
         )
         part.__dict__["_root"] = self._root

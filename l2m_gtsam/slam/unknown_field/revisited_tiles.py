@@ -34,6 +34,7 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     visits_among,
 )
 from l2m_gtsam.slam.unknown_field.visit_graph import POSE, VisitGraph, ways_between
+from l2m_gtsam.solve.row_blocks import RowBlocks
 
 KNOWN_M = 0.02  # standard deviation of a sensor's place, up to which tiles are judged
 MOST_CHANGED = 0.6  # share of the visits to known tiles, beyond which none is believed to have
@@ -276,7 +277,7 @@ def change_rows(judged: JudgedVisits, numbers: tuple[int, ...]) -> MarginalRows:
         np.concatenate(points),
         np.concatenate(residual),
         csr_array(block_diag(*whitening)),
-        csr_array(block_diag(*nuisance)),
+        RowBlocks.of(block_diag(*nuisance)),
         np.asarray(np.linalg.inv(covariance), dtype=np.float64),
         np.repeat(np.arange(len(numbers)), [len(each) for each in points]),
     )

@@ -12,6 +12,7 @@ from l2m_gtsam.calibration.stretch_causes import DisagreeingPlaces
 from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.records.places import Cause, clear_cause
+from l2m_gtsam.solve.row_blocks import RowBlocks
 
 NOISE_UT, SIZE_UT = 0.2, 3.0
 LAPS, SLOTS, SENSORS = 2, 240, 3
@@ -53,7 +54,7 @@ def causes_of(field: FloatArray, wrong: BoolArray, where: BoolArray, at: FloatAr
         points=at,
         residual=field + noise,
         whitening=white,
-        nuisance=csr_array(white @ np.tile(np.eye(3), (len(field), 1))),
+        nuisance=RowBlocks.of(np.tile(np.eye(3) / NOISE_UT, (len(field), 1))),
         prior=np.eye(3),
         slot=SLOT,
     )

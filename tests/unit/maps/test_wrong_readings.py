@@ -9,6 +9,7 @@ from l2m_gtsam.maps.sources.found_sources import FoundSources
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
 from l2m_gtsam.maps.sources.source import SourceShape
+from l2m_gtsam.solve.row_blocks import RowBlocks
 
 NOISE_UT = 0.1
 DIPOLE = SourceShape.dipole(np.array([1.0, 0.8, 0.5]), np.array([3.0, -2.0, 9.0]))
@@ -27,7 +28,7 @@ def rows_with(field: FloatArray, points: FloatArray, seed: int) -> MarginalRows:
         points=points,
         residual=field + noise.reshape(-1, 3) + np.array([3.0, -1.0, 2.0]),
         whitening=white,
-        nuisance=csr_array(white @ np.tile(np.eye(3), (count, 1))),
+        nuisance=RowBlocks.of(white @ np.tile(np.eye(3), (count, 1))),
         prior=1e-4 * np.eye(3),
         slot=np.repeat(np.arange(count // 2), 2),
     )

@@ -13,6 +13,7 @@ from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.qa.metrics.coordinates import PARAMETERS
 from l2m_gtsam.records.places import CLEAR, WhatChanged
 from l2m_gtsam.records.validation import CalibrationPart
+from l2m_gtsam.solve.row_blocks import RowBlocks
 from l2m_gtsam.validation.places import (
     ANYTHING,
     PlaceOrVehicle,
@@ -32,7 +33,7 @@ def rows_of(design: FloatArray, e: FloatArray) -> MarginalRows:
         points=np.zeros((N, 3)),
         residual=e.reshape(N, 3),
         whitening=csr_array(np.eye(3 * N)),
-        nuisance=csr_array(design),
+        nuisance=RowBlocks.of(design),
         prior=np.eye(PARAMETERS),
         slot=np.arange(N),
     )
