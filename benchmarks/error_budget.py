@@ -17,8 +17,9 @@ from l2m_gtsam.calibration.alternation import Alternated, OneKeyOptions, start_e
 from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.one_key import settle, solve_one_key
 from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
-from l2m_gtsam.calibration.uncertain import settle_by_any, solve_uncertain
+from l2m_gtsam.calibration.uncertain import solve_uncertain
 from l2m_gtsam.calibration.uncertain_graph import UncertainDrive
+from l2m_gtsam.calibration.uncertain_rounds import settle_by_any
 from l2m_gtsam.calibration.view import RememberedMap, StandIns
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap

@@ -26,30 +26,22 @@ from l2m_gtsam.calibration.budget.unseen_warp import unseen_warp
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
-from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver, Optimised
 from l2m_gtsam.calibration.parts_alone import ByParts
-from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.stated_sizes import beside_processes, leave_noise, noise_is_short
 from l2m_gtsam.calibration.uncertain_graph import (
-    ROUND_SIGMAS,
-    THERE_SIGMAS,
     UncertainDrive,
     UncertainProblem,
     starting_values,
 )
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
+from l2m_gtsam.calibration.uncertain_rounds import Beginning, Settled, settle_by_any
 from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap, View
-from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.parallel.threads import side_by_side
 from l2m_gtsam.records.error_budget import DisturbanceKind, StatedSize
-from l2m_gtsam.solve.rank import Determinacy, RankOptions
+from l2m_gtsam.solve.rank import Determinacy
 
-MAX_ROUNDS = 10
-# Where places are open errors of the map stand in for them, and steps overshoot.
-ROUNDS_OF_OPEN = 20
 SEARCHED = 0.6  # of the way, when it is known which processes a drive has
-SETTLED_SIGMAS = 0.1  # what such a step is at most in the last round
 
 
 @dataclass(frozen=True)
@@ -205,11 +197,11 @@ class ProcessStart:
 
     drive: UncertainDrive
     estimate: Estimate
-    begin: "Beginning | None"
+    begin: Beginning | None
 
 
 def start_with(
-    found: "Settled",
+    found: Settled,
     shown: Searched,
     field_map: QueryableMap,
     errors: UncertainMap,
@@ -244,7 +236,7 @@ def start_with(
     return ProcessStart(UncertainDrive.of(*given), estimate, None)
 
 
-def with_processes(found: "Settled", budget: Budget, shown: Searched) -> gtsam.Values:
+def with_processes(found: Settled, budget: Budget, shown: Searched) -> gtsam.Values:
     """Return where the optimum is with processes that are no errors of poses, to first order."""
     delta = gtsam.VectorValues()
     for key, at in found.optimum.joint.columns.items():
@@ -254,25 +246,6 @@ def with_processes(found: "Settled", budget: Budget, shown: Searched) -> gtsam.V
     for key, weights in zip(budget.variables, shown.weights, strict=True):
         values.insert(key, weights)
     return values
-
-
-def settle_by_any(
-    drive: UncertainDrive,
-    near: Estimate,
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
-    progress: Callable[[float], None],
-    begin: "Beginning | None" = None,
-) -> "Settled":
-    """Solve by Cholesky, and where that is refused by QR; from no shared error if not elsewhere."""
-    if begin is None:
-        zero = starting_values(near, drive.view.sensors, drive.prior.coverage)
-        begin = Beginning(zero, near=False)
-    for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):
-        found = settle(drive, near, begin, tests, options, solver, progress)
-        if found.ending is not Ending.SINGULAR:
-            break
-    return found
 
 
 def step_uncertain(
@@ -309,150 +282,3 @@ def step_by_any(problem: UncertainProblem, values: gtsam.Values) -> Optimised:
         if step.ending is not Ending.SINGULAR:
             break
     return step
-
-
-@dataclass(frozen=True)
-class Beginning:
-    """Where the rounds of the graph begin.
-
-    Attributes
-    ----------
-    values
-        All variables.
-    near
-        Whether the optimum is so near that no descent is needed.
-    readings
-        Those of the drive where their poses are likely, if that is known.
-    """
-
-    values: gtsam.Values
-    near: bool
-    readings: Readings | None = None
-
-
-@dataclass(frozen=True)
-class Settled:
-    """Where the rounds ended.
-
-    Attributes
-    ----------
-    optimum
-        That of the graph of the last round.
-    estimate
-        All sensors there, with their noise.
-    ending
-        How the last optimisation ended.
-    unsettled
-        Sensors whose estimate or weights another round would change.
-    """
-
-    optimum: UncertainOptimum
-    estimate: Estimate
-    ending: Ending
-    unsettled: frozenset[int]
-
-    @property
-    def drive(self) -> UncertainDrive:
-        """Readings and what they share."""
-        return self.optimum.problem.drive
-
-
-def settle(
-    drive: UncertainDrive,
-    estimate: Estimate,
-    begin: Beginning,
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
-    solver: LinearSolver,
-    progress: Callable[[float], None],
-) -> Settled:
-    """Solve the graph again and again, until the weights are those of its result.
-
-    Parameters
-    ----------
-    drive
-        Readings and what they share.
-    estimate, begin
-        Where to start.
-    tests
-        Rank test of each sensor.
-    options
-        How to solve.
-    solver
-        Of the linear systems.
-    progress
-        Called with the fraction that is done.
-    """
-    sensors = drive.view.sensors
-    unsettled = frozenset(sensors)
-    values, near, readings = begin.values, begin.near, begin.readings
-    ending, begun = Ending.TOLERANCE, estimate
-    open_ = [s for s in sensors if tests[s].place_open]
-    for round_ in range(most := ROUNDS_OF_OPEN if open_ else MAX_ROUNDS):
-        held_at = estimate.as_in(begun, open_)  # else they slide on with each round
-        problem = UncertainProblem(drive, estimate, tests, options.factors, held_at, readings)
-        arrived = problem.arrive(values, options, solver, near=near)
-        values, joint = arrived.values, arrived.joint
-        optimum = UncertainOptimum(problem, values, joint)
-        if arrived.ending is Ending.SINGULAR:
-            return Settled(optimum, estimate, arrived.ending, frozenset(sensors))
-        if not near:  # then it was a descent
-            ending = arrived.ending
-        near = joint.furthest(sensors) < ROUND_SIGMAS
-        after = estimate.updated(values, sensors)
-        if options.sensor_noise_ut is None:
-            after = replace(after, noise=optimum.noise())
-        # The first weights are those of the optimum with independent errors, if none is predicted.
-        if round_ > 0 or begin.near:
-            unsettled = still_changing(problem, joint, after, estimate, options.rank)
-        estimate = after
-        if not unsettled:
-            break
-        readings = problem.at_likely_poses(values)
-        progress((round_ + 2) / (most + 1))
-    return Settled(optimum, estimate, ending, unsettled)
-
-
-def still_changing(
-    problem: UncertainProblem,
-    joint: JointInformation,
-    after: Estimate,
-    before: Estimate,
-    options: RankOptions,
-) -> frozenset[int]:
-    """Return the sensors that another round would change: all if it is what they share.
-
-    One whose place is open may go wherever it likes along what its readings do not determine.
-
-    Parameters
-    ----------
-    problem
-        The round.
-    joint
-        All variables together, a step before the end of it.
-    after, before
-        Sensors with their noise at its end and in its weights.
-    options
-        The scales of the rank test.
-    """
-    sensors = problem.drive.view.sensors
-    changing = frozenset(
-        s
-        for s in sensors
-        if joint.sigmas(s, determined_rows(problem.tests[s], options)) >= SETTLED_SIGMAS
-        or not problem.same_noise(after, before, s)
-    )
-    return changing or frozenset(sensors if joint.decrement >= THERE_SIGMAS else ())
-
-
-def determined_rows(test: Determinacy, options: RankOptions) -> FloatArray | None:
-    """Return what is determined of a sensor whose place is open: rows over its parameters, (K, 16).
-
-    None for others, of which all is looked at.
-    """
-    if not test.place_open:
-        return None
-    known = test.determined / options.scale()
-    rows = np.zeros((len(known) + 1, SENSOR))
-    rows[:-1, :-1], rows[-1, -1] = known, 1.0
-    return rows

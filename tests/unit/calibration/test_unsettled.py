@@ -10,8 +10,8 @@ import pytest
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.one_key import is_changing
-from l2m_gtsam.calibration.uncertain import still_changing
 from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
+from l2m_gtsam.calibration.uncertain_rounds import still_changing
 from l2m_gtsam.solve.rank import Determinacy, RankOptions, determinacy
 
 SCALES = RankOptions()
