@@ -14,8 +14,8 @@ from l2m_gtsam.qa.report.figures.comparison import field_errors_figure, nis_figu
 from l2m_gtsam.qa.report.figures.statistics import sigmas_figure
 from l2m_gtsam.qa.report.page import Identity, Picture, pictures, render
 from l2m_gtsam.qa.report.svg import SETTINGS
+from l2m_gtsam.qa.verdict.changed_parts import NAMES, amount
 from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, place_of
-from l2m_gtsam.qa.verdict.validation import NAMES, amount
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.validation import (
     CalibrationPart,

@@ -5,52 +5,32 @@ from collections.abc import Callable
 import numpy as np
 
 from l2m_gtsam.qa.metrics.changes import change_of
-from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions, thresholds
+from l2m_gtsam.qa.options import QaOptions, thresholds
+from l2m_gtsam.qa.verdict.changed_parts import (
+    NAMES,
+    amount,
+    by_how_much,
+    change_reason,
+    limits_of,
+)
+from l2m_gtsam.qa.verdict.displacement import displaced, moved_with_all
 from l2m_gtsam.qa.verdict.places import source_reasons
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, beyond_range, outside_map
 from l2m_gtsam.qa.verdict.uncertainty import jump_sentence
 from l2m_gtsam.records.error_budget import MOST_JUMPS, OffsetDrift
 from l2m_gtsam.records.validation import (
-    CalibrationChange,
     CalibrationComparison,
     CalibrationPart,
     ComparedSensor,
-    Displaced,
-    Displacement,
     DriveValidation,
     NotValidated,
     ValidatedSensor,
 )
-from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict, worst
-from l2m_gtsam.text import in_unit, significant, with_sigma
+from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict
+from l2m_gtsam.text import significant
 
 SHARED_LIMITS = ("unexplained", "rejected", "outside_map", "saturated")
 EXPECTED_TIMES = 2.0  # a refit that leaves no more than this of what is expected fits the map
-NAMES = {
-    CalibrationPart.PLACE: "its place t",
-    CalibrationPart.ROTATION: "its rotation",
-    CalibrationPart.GAINS: "the gains of its axes (C)",
-    CalibrationPart.ANGLES: "the angles between its axes (C)",
-    CalibrationPart.OFFSET: "its offset H",
-    CalibrationPart.CLOCK: "its clock",
-}
-# Factor from the units of ``CalibrationChange``, unit, and axes of its parts.
-SHOWN = {
-    CalibrationPart.PLACE: (1e3, "mm", " along the lidar's x, y, z"),
-    CalibrationPart.ROTATION: (1.0, "°", " about its own x, y, z"),
-    CalibrationPart.GAINS: (1e2, "%", " of its x, y, z"),
-    CalibrationPart.ANGLES: (1.0, "°", " less between x y, y z, z x"),
-    CalibrationPart.OFFSET: (1.0, "µT", " along its x, y, z"),
-    CalibrationPart.CLOCK: (1e3, "ms", ""),
-}
-MEANINGS = {
-    CalibrationPart.PLACE: "it was moved, or its mount gave way",
-    CalibrationPart.ROTATION: "it was turned, or its mount gave way",
-    CalibrationPart.GAINS: "its driver scales otherwise, or soft iron near it has changed",
-    CalibrationPart.ANGLES: "soft iron near it has changed",
-    CalibrationPart.OFFSET: "something magnetic on the vehicle was added, removed or magnetised",
-    CalibrationPart.CLOCK: "its stamps have another delay than before",
-}
 
 
 def judge_validation(
@@ -71,12 +51,12 @@ def judge_validation(
     found: dict[str, list[Reason]] = {}
     if drive is not None:
         shared += _on_drive(drive, options)
-        shared += _displaced(drive, options)
+        shared += displaced(drive, options)
         for sensor in drive.sensors:
             found.setdefault(sensor.sensor, []).extend(
                 [
                     *_exchanged(sensor),
-                    *_moved_with_all(drive, options),
+                    *moved_with_all(drive, options),
                     *_jumped(drive, sensor, options),
                     *_drifted(drive, sensor, options),
                     *_on_sensor(sensor, options),
@@ -118,79 +98,6 @@ def _on_drive(drive: DriveValidation, options: QaOptions) -> list[Reason]:
         *source_reasons(drive.sources),
         *(Reason(Level.PASS, each) for each in drive.notes),
     ]
-
-
-def _displaced(drive: DriveValidation, options: QaOptions) -> list[Reason]:
-    """Return the displacement that all sensors share, and what it is likely of."""
-    found = drive.displacement
-    if found is None:
-        return _blind_to_shifts(drive, options)
-    level, count = _displaced_level(found, options), len(drive.sensors)
-    if Displaced.LIDAR not in found.of:
-        what = f"all {count} sensors read" if count > 1 else "is read"
-        text = (
-            f"What {what} fits if the poses are {_moved_by(found, 'map')}: their frame is not that "
-            "of the map. Take poses on the map's point cloud. The sensors were tested with poses "
-            "that were moved so."
-        )
-        return [Reason(min(level, Level.WARN, key=lambda each: each.rank), text)]
-    tied = ", or the poses are in another frame than the map's" if len(found.of) > 1 else ""
-    text = (
-        f"All {count} sensors together {_moved_by(found, 'lidar')}: the mount of the lidar, or of "
-        f"what carries them all, gave way or was changed{tied}. What is said of single sensors is "
-        "beside it."
-    )
-    return [Reason(level, text)]
-
-
-def _blind_to_shifts(drive: DriveValidation, options: QaOptions) -> list[Reason]:
-    """Return which shifts of all sensors together, as large as fails, need not have shown."""
-    limit = options.validation.place_m.fail
-    what = {Displaced.LIDAR: "of all sensors together", Displaced.FRAME: "of the poses' frame"}
-    hidden = " and ".join(
-        f"{what[each.of]} (it shows {amount(CalibrationPart.PLACE, each.size)} and more)"
-        if np.isfinite(each.size)
-        else f"{what[each.of]} (it shows none)"
-        for each in drive.detectable_shifts
-        if each.size > limit
-    )
-    if not hidden:
-        return []
-    text = f"This drive cannot rule out a shift by {amount(CalibrationPart.PLACE, limit)} {hidden}."
-    return [Reason(Level.WARN, text)]
-
-
-def _moved_with_all(drive: DriveValidation, options: QaOptions) -> list[Reason]:
-    """Return of one sensor that it moved as all did."""
-    found = drive.displacement
-    if found is None or Displaced.LIDAR not in found.of:
-        return []
-    text = "It moved with all others (see above): its t and its rotation are not what they were."
-    return [Reason(_displaced_level(found, options), text)]
-
-
-def _displaced_level(found: Displacement, options: QaOptions) -> Level:
-    limits = limits_of(options.validation)
-    return worst(limits[each.part].level(each.size) for each in _displacements(found))
-
-
-def _displacements(found: Displacement) -> list[CalibrationChange]:
-    """Return the parts of a displacement that there are."""
-    each = (
-        (CalibrationPart.PLACE, found.shift, found.shift_sigma),
-        (CalibrationPart.ROTATION, found.turn, found.turn_sigma),
-    )
-    return [change_of(part, np.array(v), np.array(s), 0.0) for part, v, s in each if any(s)]
-
-
-def _moved_by(found: Displacement, axes: str) -> str:
-    """Return a displacement along the axes of a frame as a phrase."""
-    verbs = {CalibrationPart.PLACE: "moved", CalibrationPart.ROTATION: "turned"}
-    ways = {CalibrationPart.PLACE: "along", CalibrationPart.ROTATION: "about"}
-    return " and ".join(
-        f"{verbs[each.part]} by {_size_and_parts(each)} {ways[each.part]} the {axes}'s x, y, z"
-        for each in _displacements(found)
-    )
 
 
 def _exchanged(sensor: ValidatedSensor) -> list[Reason]:
@@ -270,23 +177,11 @@ def _changed(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     if options.rejected.level(share) is not Level.PASS:
         doubt = " (Readings were rejected, see below; other changes near them may bias this.)"
     return [
-        _change(
+        change_reason(
             each, options, "On this drive {name} differ{s} from the calibration by {amount}", doubt
         )
         for each in sensor.changes
     ]
-
-
-def _change(change: CalibrationChange, options: QaOptions, text: str, doubt: str = "") -> Reason:
-    """Return a change as a reason; a negligible one is only a note."""
-    level = limits_of(options.validation)[change.part].level(change.size)
-    several = change.part in (CalibrationPart.GAINS, CalibrationPart.ANGLES)
-    s, has = ("", "have") if several else ("s", "has")
-    what = text.format(name=NAMES[change.part], s=s, has=has, amount=by_how_much(change))
-    what = what[0].upper() + what[1:]
-    if level is Level.PASS:
-        return Reason(level, f"{what}: significant but negligible.")
-    return Reason(level, f"{what}: {MEANINGS[change.part]}.{doubt}")
 
 
 def _consistent(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
@@ -358,7 +253,9 @@ def _since(sensor: ComparedSensor, options: QaOptions) -> list[Reason]:
     whole = sensor.test("all")
     if sensor.changes:
         return [
-            _change(each, options, "since the old calibration {name} {has} changed by {amount}")
+            change_reason(
+                each, options, "since the old calibration {name} {has} changed by {amount}"
+            )
             for each in sensor.changes
         ]
     if whole.chance < options.validation.chance / (len(NAMES)):
@@ -369,37 +266,3 @@ def _since(sensor: ComparedSensor, options: QaOptions) -> list[Reason]:
         )
         return [Reason(Level.WARN, text)]
     return [Reason(Level.PASS, "No change since the old calibration beyond both uncertainties.")]
-
-
-def limits_of(options: ValidationOptions) -> dict[CalibrationPart, Limit]:
-    """Return from where on a change of each part is worth a warning or a failure."""
-    return {
-        CalibrationPart.PLACE: options.place_m,
-        CalibrationPart.ROTATION: options.rotation_deg,
-        CalibrationPart.GAINS: options.gain,
-        CalibrationPart.ANGLES: options.angle_deg,
-        CalibrationPart.OFFSET: options.offset_ut,
-        CalibrationPart.CLOCK: options.clock_s,
-    }
-
-
-def amount(part: CalibrationPart, size: float) -> str:
-    """Return a size with its unit."""
-    factor, unit, _ = SHOWN[part]
-    return in_unit(significant(factor * size, 2), unit)
-
-
-def by_how_much(change: CalibrationChange) -> str:
-    """Return size, parts and sigmas of a change."""
-    return f"{_size_and_parts(change)}{SHOWN[change.part][2]}"
-
-
-def _size_and_parts(change: CalibrationChange) -> str:
-    factor, unit, _ = SHOWN[change.part]
-    parts = ", ".join(
-        with_sigma(factor * value, factor * sigma)
-        for value, sigma in zip(change.change, change.sigma, strict=True)
-    )
-    if len(change.change) == 1:
-        return in_unit(parts, unit)
-    return f"{amount(change.part, change.size)}: {in_unit(f'({parts})', unit)}"
