@@ -10,12 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.calibration.averaged_rows import (
-    AveragedDrive,
-    AveragingOptions,
-    averaged,
-    pose_shares,
-)
+from l2m_gtsam.calibration.averaged_rows import AveragedDrive, pose_shares
+from l2m_gtsam.calibration.averages import AveragingOptions, averaged
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import offset_gain
 from l2m_gtsam.calibration.coverage import UncertainMap, errors_over_stated

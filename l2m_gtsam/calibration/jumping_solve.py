@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from l2m_gtsam.calibration.averaged_rows import Averages
+from l2m_gtsam.calibration.averages import Averages
 from l2m_gtsam.calibration.causes import REJECTED
 from l2m_gtsam.calibration.changed_places import (
     ChangesOptions,

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.calibration.averaged_rows import AveragedDrive, averaged, with_calibration
+from l2m_gtsam.calibration.averaged_rows import AveragedDrive, with_calibration
+from l2m_gtsam.calibration.averages import averaged
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import vehicle_gain
 from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected

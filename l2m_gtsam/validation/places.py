@@ -11,7 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from l2m_gtsam.calibration.averaged_rows import AveragedDrive, averaged, with_calibration
+from l2m_gtsam.calibration.averaged_rows import AveragedDrive, with_calibration
+from l2m_gtsam.calibration.averages import averaged
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources
 from l2m_gtsam.calibration.changed_places import ChangesOptions, is_place_of, suspected

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2m_gtsam.calibration.averaged_rows import spikes
+from l2m_gtsam.calibration.averages import spikes
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
