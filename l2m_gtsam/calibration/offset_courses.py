@@ -1,9 +1,9 @@
 """H that changes during a drive: it jumps at one moment, or drifts all the time.
 
-A tool that is laid beside a sensor makes it jump, a sensor that warms up makes it drift. Against
-the map a jump looks like steel all along the rest of the path, and sources are found that imitate
-it; a drift looks like changes of C. Both are looked for in the same averaged readings as steel, the
-sensors free, and stand first if they explain more of them.
+A tool that is laid beside a sensor makes it jump; a sensor that warms up makes it drift, ever more
+slowly. Against the map a jump looks like steel all along the rest of the path, and sources are
+found that imitate it; a drift looks like changes of C. Both are looked for in the same averaged
+readings as steel, the sensors free, and stand first if they explain more of them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,11 +17,12 @@ from l2m_gtsam.calibration.causes import gains, sensor_offsets
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.sources.found_sources import price
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.records.error_budget import MOST_JUMPS, OffsetDrift, OffsetJump
+from l2m_gtsam.records.error_budget import MOST_JUMPS, OffsetDrift, OffsetJump, drift_share
 
 AXES = 3
 MOMENTS = 40  # at which a jump is tried at once
 FEWEST = 20  # averages of the sensor before it, and after: what is shorter is a stretch
+SLOWING = (0.5, 0.25, 0.12, 0.06)  # time constants of drifts, in the length of the drive
 ANYTHING_UT = 100.0  # standard deviation of a jump or a drift before readings
 Course = OffsetJump | OffsetDrift
 
@@ -36,25 +37,29 @@ class FoundCourse:
         Its index.
     stamp_ns
         Of the first average after a jump; a drift has none.
+    time_constant_s
+        Of a drift that slows down.
     features
         What it does to averages per uT along the sensor's axes, map frame, shape (N, 3, 3).
     """
 
     sensor: int
     stamp_ns: int | None
+    time_constant_s: float | None
     features: FloatArray
 
     @property
     def parameters(self) -> int:
-        """How many numbers describe it: the moment of a jump is one."""
-        return AXES + (self.stamp_ns is not None)
+        """How many numbers describe it: the moment of a jump, or the time constant, is one."""
+        return AXES + (self.stamp_ns is not None or self.time_constant_s is not None)
 
     def record(self, readings: Readings, change: FloatArray, sigma: FloatArray) -> Course:
         """Return it as it is reported, changes and standard deviations in uT, shapes (3,)."""
         name, start = readings.sensors[self.sensor], int(readings.stamp_ns.min())
         own = tuple(change.tolist()), tuple(sigma.tolist())
         if self.stamp_ns is None:
-            return OffsetDrift(name, start, 1e-9 * int(np.ptp(readings.stamp_ns)), *own)
+            whole_s = 1e-9 * int(np.ptp(readings.stamp_ns))
+            return OffsetDrift(name, start, whole_s, *own, self.time_constant_s)
         return OffsetJump(name, self.stamp_ns, 1e-9 * (self.stamp_ns - start), *own)
 
 
@@ -150,7 +155,7 @@ class CourseSearch:
             jumps = [stamp for stamp in before if stamp is not None]
             tried = [self.jump(sensor, jumps)] if len(jumps) < MOST_JUMPS else []
             if len(jumps) == len(before):
-                tried.append(self.drift(sensor))
+                tried += self.drifts(sensor)
             for gain, course in tried:
                 if course is not None:
                     yield gain - price(self.rows, course.parameters), course
@@ -175,18 +180,25 @@ class CourseSearch:
             gain = self._gains(features.reshape(len(own), AXES, -1))
             best = int(np.argmax(gain))
             if len(few) == len(at):
-                jump = FoundCourse(sensor, int(stamps[few[best]]), features[:, :, best])
+                jump = FoundCourse(sensor, int(stamps[few[best]]), None, features[:, :, best])
                 return float(gain[best]), jump
             at = np.arange(few[max(best - 1, 0)], few[min(best + 1, len(few) - 1)] + 1)
 
-    def drift(self, sensor: int) -> tuple[float, FoundCourse | None]:
-        """Return the steady drift of a sensor."""
+    def drifts(self, sensor: int) -> list[tuple[float, FoundCourse | None]]:
+        """Return drifts of a sensor: steady, and slowing down."""
         stamp_ns = self.readings.stamp_ns
         seconds = 1e-9 * (stamp_ns - stamp_ns.min())
         if not seconds.any():
-            return 0.0, None
-        features = self.offsets[sensor] * (seconds / seconds.max())[:, None, None]
-        return float(self._gains(features)[0]), FoundCourse(sensor, None, features)
+            return []
+        whole = float(seconds.max())
+        constants = [None, *(share * whole for share in SLOWING)]
+        shares = np.stack([drift_share(seconds, whole, each) for each in constants], axis=1)
+        features = self.offsets[sensor][:, :, None, :] * shares[:, None, :, None]
+        gain = self._gains(features.reshape(len(features), AXES, -1)).tolist()
+        return [
+            (gain[k], FoundCourse(sensor, None, each, features[:, :, k]))
+            for k, each in enumerate(constants)
+        ]
 
     def _gains(self, features: FloatArray) -> FloatArray:
         """Return what courses explain each, if H may follow them by anything."""
@@ -216,7 +228,7 @@ def without_course(readings: Readings, course: Course) -> Readings:
     if isinstance(course, OffsetJump):
         number = (stamp_ns >= course.stamp_ns).astype(float)
     else:
-        number = 1e-9 * (stamp_ns - course.stamp_ns) / course.seconds
+        number = course.share(stamp_ns)
     numbers = np.empty((len(readings), 0)) if readings.regressors is None else readings.regressors
     return replace(
         readings,

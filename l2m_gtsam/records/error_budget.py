@@ -5,7 +5,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.record import Record, Row
 
 
@@ -136,7 +136,7 @@ class OffsetJump(Record):
 
 @dataclass(frozen=True)
 class OffsetDrift(Record):
-    """H that drifts steadily over a drive.
+    """H that drifts over a drive, steadily or ever more slowly.
 
     Attributes
     ----------
@@ -146,6 +146,8 @@ class OffsetDrift(Record):
         When the drive begins, and how long it is.
     change, sigma
         H at the end less H at the beginning and its standard deviation, uT.
+    time_constant_s
+        Of the exponential by which it slows down; absent where it is steady.
     """
 
     sensor: str
@@ -153,6 +155,27 @@ class OffsetDrift(Record):
     seconds: float
     change: Row
     sigma: Row
+    time_constant_s: float | None = None
+
+    def share(self, stamp_ns: IntArray) -> FloatArray:
+        """Return how much of it is done at some stamps, 0 to 1 during the drive, shape (N,)."""
+        elapsed_s: FloatArray = 1e-9 * (stamp_ns - self.stamp_ns).astype(np.float64)
+        return drift_share(elapsed_s, self.seconds, self.time_constant_s)
+
+    @property
+    def half_s(self) -> float:
+        """After how many seconds half of it is done."""
+        if self.time_constant_s is None:
+            return self.seconds / 2
+        whole = -np.expm1(-self.seconds / self.time_constant_s)
+        return float(-self.time_constant_s * np.log1p(-whole / 2))
+
+
+def drift_share(elapsed_s: FloatArray, whole_s: float, time_constant_s: float | None) -> FloatArray:
+    """Return how much of a drift is done after some time of the whole."""
+    if time_constant_s is None:
+        return elapsed_s / whole_s
+    return np.asarray(np.expm1(-elapsed_s / time_constant_s) / np.expm1(-whole_s / time_constant_s))
 
 
 @dataclass(frozen=True)

@@ -140,8 +140,9 @@ def _of_drift(drift: OffsetDrift, options: QaOptions) -> Reason:
     change, sigma = np.array(drift.change), np.array(drift.sigma)
     whole = change_of(CalibrationPart.OFFSET, change, sigma, 0.0)
     text = (
-        f"Over the drive its offset H drifts by {by_how_much(whole)}: the sensor warms up, or "
-        "something on the vehicle gains or loses magnetisation. Its other changes are beside that."
+        f"Over the drive its offset H drifts by {by_how_much(whole)}, half of it in the first "
+        f"{drift.half_s:.0f} s: the sensor warms up, or something on the vehicle gains or loses "
+        "magnetisation. Its other changes are beside that."
     )
     return Reason(options.validation.offset_ut.level(whole.size), text)
 

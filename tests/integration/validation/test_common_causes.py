@@ -12,6 +12,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.validation import judge_validation
+from l2m_gtsam.records.error_budget import drift_share
 from l2m_gtsam.records.validation import (
     CalibrationPart,
     DetectableShift,
@@ -237,11 +238,16 @@ def test_h_that_jumps_again_and_again_wanders() -> None:
     assert "its offset H wanders, by 9." in told or "its offset H wanders, by 8." in told
 
 
-def drifting(recording: Recording, sensor: int, change: FloatArray) -> Recording:
-    """Return a drive over which H of a sensor drifts by this in uT, shape (3,)."""
+def drifting(
+    recording: Recording, sensor: int, change: FloatArray, slowing: float | None = None
+) -> Recording:
+    """Return a drive over which H of a sensor drifts by this in uT, shape (3,).
+
+    ``slowing`` is its time constant over the length of the drive.
+    """
     series = list(recording.series)
     stamp_ns = series[sensor].stamp_ns
-    share = (stamp_ns - stamp_ns.min()) / np.ptp(stamp_ns)
+    share = drift_share((stamp_ns - stamp_ns.min()) / np.ptp(stamp_ns), 1.0, slowing)
     field = series[sensor].field + share[:, None] * change
     series[sensor] = replace(series[sensor], field=field)
     return replace(recording, series=tuple(series))
@@ -261,6 +267,24 @@ def test_a_drift_of_h_is_no_change_of_the_rest(change: tuple[float, ...]) -> Non
     (first, second) = judge_validation(found, None, QaOptions()).sensors
     assert "Over the drive its offset H drifts by" in " ".join(e.text for e in first.reasons)
     assert not any("drifts" in each.text for each in second.reasons)
+
+
+@pytest.mark.parametrize(("slowing", "size"), [(0.15, 3.0), (0.3, 1.0)])
+def test_a_sensor_that_warms_up_does_not_jump(slowing: float, size: float) -> None:
+    """Time constants between those that are tried."""
+    options, place = hall()
+    recording = changed_drive(options, place, TrueCause.NOTHING, 1).recording
+    change = size * np.array([0.0, 0.6, 0.8])
+    warm = drifting(recording, 0, change, slowing)
+    found = validate(warm, place.field_map, place.calibration, CalibrationOptions(), 1e-3)
+    (drift,) = found.drifts
+    assert drift.sensor == found.sensors[0].sensor
+    assert drift.time_constant_s is not None
+    assert 0.5 < drift.time_constant_s / (slowing * drift.seconds) < 2
+    # A constant beside the true one by a quarter leaves up to a twentieth of the drift.
+    assert np.linalg.norm(drift.change - change) < 0.05 * size + 5 * np.linalg.norm(drift.sigma)
+    assert found.jumps == ()
+    assert [each.changes for each in found.sensors] == [(), ()]
 
 
 def test_drifts_and_jumps_are_told_in_a_map_that_does_not_know_its_errors() -> None:
