@@ -103,8 +103,8 @@ def is_right(
     """Return whether what changed is named, where it is, and nothing else.
 
     A mount that is turned is one displacement of all sensors; or each of them is named, which it
-    moves, too, by as much as may be named or too little to be. Of a map
-    of another place it is said that it does not fit, and nothing of steel.
+    moves, too, by as much as may be named or too little to be. Of a map of another place it is said
+    that it does not fit, and nothing of steel.
     """
     if change is TrueCause.ELSEWHERE:
         return not found.sources and verdict.reasons[0].text.startswith(WRONG_MAP)
@@ -114,7 +114,7 @@ def is_right(
     if drive.steel is None and found.sources:
         return False
     parts = [{each.part for each in sensor.changes} for sensor in found.sensors]
-    if found.jumps:
+    if found.jumps or found.drifts:
         return False
     if found.displacement is not None:
         of_mount = change is TrueCause.TURNED and Displaced.LIDAR in found.displacement.of
