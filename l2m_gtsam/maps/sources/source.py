@@ -11,9 +11,11 @@ with nodes ``s_k`` and weights ``w_k`` of Gauss and Legendre's quadrature over t
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.dipoles import add_dipoles, moment_features
+from l2m_gtsam.maps.harmonic.dipoles import SOFT, add_dipoles
+from l2m_gtsam.maps.harmonic.triangular import FAST
 
 UT_M3 = 0.1  # field of 1 A m^2 at 1 m: mu_0 / (4 pi) in uT m^3 per A m^2
 POSITION, MOMENT, HALF_AXIS = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -72,25 +74,11 @@ class SourceShape:
         add_dipoles(points, self._places(s), UT_M3 * np.outer(w, self.moment), field, gradient)
         return field, gradient
 
-    def per_moment(self, points: FloatArray) -> FloatArray:
-        """Return the field of a unit moment along each axis, uT per A m^2, shape (N, 3, 3)."""
-        s, w = self._nodes()
-        each = moment_features(np.ascontiguousarray(points), self._places(s))
-        return np.asarray(UT_M3 * np.einsum("nikj,k->nij", each.reshape(-1, 3, len(s), 3), w))
-
     def derivatives(self, points: FloatArray) -> FloatArray:
         """Return derivatives of the field by all parameters, shape (N, 3, 9)."""
-        J = np.empty((len(points), 3, PARAMETERS))
-        J[:, :, MOMENT] = self.per_moment(points)
+        J = np.zeros((len(points), 3, PARAMETERS))
         # Of a dipole, too: the length of a bar starts to count with its square.
-        s, w = NODES, WEIGHTS / 2
-        J[:, :, POSITION] = J[:, :, HALF_AXIS] = 0.0
-        for node, share in zip(s, w, strict=True):
-            at = (self.position + node * self.half_axis)[None]
-            _, G = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
-            add_dipoles(points, at, UT_M3 * share * self.moment[None], _, G)
-            J[:, :, POSITION] -= G
-            J[:, :, HALF_AXIS] -= node * G
+        add_derivatives(points, self._places(NODES), self.moment, NODES, WEIGHTS / 2, J)
         return J
 
     def _nodes(self) -> tuple[FloatArray, FloatArray]:
@@ -98,3 +86,47 @@ class SourceShape:
 
     def _places(self, s: FloatArray) -> FloatArray:
         return np.ascontiguousarray(self.position + np.outer(s, self.half_axis))
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def add_derivatives(
+    points: FloatArray,
+    places: FloatArray,
+    moment: FloatArray,
+    nodes: FloatArray,
+    weights: FloatArray,
+    J: FloatArray,
+) -> None:
+    """Add derivatives of a bar's field by its parameters, shape (N, 3, 9).
+
+    Parameters
+    ----------
+    points
+        Metres, shape (N, 3).
+    places, nodes, weights
+        Of K nodes: metres, shape (K, 3), along the bar from -1 to 1, and shares of the moment.
+    moment
+        In A m^2, shape (3,).
+    """
+    for n in range(len(points)):
+        for k in range(len(nodes)):
+            r = (
+                points[n, 0] - places[k, 0],
+                points[n, 1] - places[k, 1],
+                points[n, 2] - places[k, 2],
+            )
+            inverse = 1.0 / max(r[0] * r[0] + r[1] * r[1] + r[2] * r[2], SOFT * SOFT)
+            cube = UT_M3 * weights[k] * inverse * np.sqrt(inverse)
+            fifth = 3.0 * cube * inverse
+            pull = fifth * (moment[0] * r[0] + moment[1] * r[1] + moment[2] * r[2])
+            steep = -5.0 * pull * inverse
+            for i in range(3):
+                for j in range(3):
+                    by_moment = fifth * r[i] * r[j]
+                    by_place = -fifth * (r[i] * moment[j] + moment[i] * r[j]) - steep * r[i] * r[j]
+                    if i == j:
+                        by_moment -= cube
+                        by_place -= pull
+                    J[n, i, j] += by_place
+                    J[n, i, 3 + j] += by_moment
+                    J[n, i, 6 + j] += nodes[k] * by_place
