@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.qa.metrics.mounting import gains
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.qa.options import FleetOptions
@@ -19,6 +19,8 @@ NAN = float("nan")
 DIGITS = 9  # well below any sigma, in metres as in microtesla
 MOST = 500  # rotations that are compared each with each: 2 MB
 MEDIAN = np.pi / 2  # variance of a median beside that of a mean, of normal numbers
+AGREE = 3  # drives that must agree at least: two of several always lie close to each other
+CUT = 2.5  # standard deviations within which a value belongs to those that agree
 
 
 def sensor_rows(result: CalibrationResult, verdict: Verdict) -> tuple[SensorRow, ...]:
@@ -184,7 +186,9 @@ def _outliers(parameter: Parameter, options: FleetOptions) -> dict[int, Outlier]
     if len(known) < options.drives:
         return {}
     value, sigma = parameter.value[known], parameter.sigma[known]
-    d, expected = value - np.median(value), expected_deviation(value, sigma)
+    usual = agreeing(value)
+    d = value - np.median(value[usual])
+    expected = expected_deviation(value, sigma, usual)
     beyond = (np.abs(d) > options.outlier * expected) & (np.abs(d) > parameter.least)
     return {
         int(known[k]): Outlier(parameter.name, float(d[k]), float(abs(d[k]) / expected[k]))
@@ -192,17 +196,40 @@ def _outliers(parameter: Parameter, options: FleetOptions) -> dict[int, Outlier]
     }
 
 
-def expected_deviation(value: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return how far each of N values may well be from their median, shape (N,).
+def agreeing(value: FloatArray) -> BoolArray:
+    """Return which of N values agree with each other, shape (N,): at least half of them.
+
+    Those about the middle of the shortest interval that holds half of all. Values that are off
+    together do not widen that interval as long as they are not the larger part: of a sensor that
+    was displaced between drives, median and spread of all would lie between both places. Of two
+    halves the closer one counts.
+
+    Notes
+    -----
+    The least median of squares in one dimension, with its correction for few values, reweighted:
+    Rousseeuw and Leroy, Robust Regression and Outlier Detection (1987), sections 4.4 and 5.1.
+    """
+    count = len(value)
+    half = max((count + 1) // 2, min(AGREE, count))
+    ordered = np.sort(value)
+    width = ordered[half - 1 :] - ordered[: count - half + 1]
+    first = int(np.argmin(width))
+    middle = (ordered[first] + ordered[first + half - 1]) / 2
+    scale = (1 + 5 / max(count - 1, 1)) * width[first] / 2 / ndtri(0.75)
+    # Both ends of the interval belong to it, to rounding.
+    inside = (value >= ordered[first]) & (value <= ordered[first + half - 1])
+    return np.asarray(inside | (np.abs(value - middle) <= CUT * scale))
+
+
+def expected_deviation(value: FloatArray, sigma: FloatArray, usual: BoolArray) -> FloatArray:
+    """Return how far each of N values may well be from the median of the usual ones, shape (N,).
 
     The larger of the standard deviation of the difference, which holds where sigmas are true, and
-    of the values' spread, which is what drives differ by for reasons that no sigma includes. The
-    latter from the median absolute deviation, which half of all values cannot move.
+    of the usual values' spread, which is what drives differ by for reasons that no sigma includes.
     """
     # Of N normal values the median has pi / 2 times the variance of the mean.
-    of_median = MEDIAN * np.median(sigma) ** 2 / len(value)
-    # As scipy.stats.median_abs_deviation, which takes half a second to load.
-    spread = float(np.median(np.abs(value - np.median(value))) / ndtri(0.75))
+    of_median = MEDIAN * np.median(sigma[usual]) ** 2 / usual.sum()
+    spread = float(np.std(value[usual], ddof=1))
     smallest = np.finfo(float).tiny  # values that are exact and all alike
     return np.asarray(np.maximum(np.sqrt(sigma**2 + of_median), max(spread, smallest)))
 

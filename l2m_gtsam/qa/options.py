@@ -205,13 +205,13 @@ class FleetOptions(Options):
 
     outlier: PositiveFloat = 5.0
     """How many times further than expected a parameter must be from the median of the vehicle's
-    drives to be marked: both in standard deviations of the difference and in standard deviations
-    of the drives' spread (1.4826 times their median absolute deviation)."""
+    usual drives, at least half of all that agree with each other, to be marked: both in standard
+    deviations of the difference and in standard deviations of these drives' spread."""
     drives: int = Field(default=4, ge=3)
     """Drives of a vehicle that know the parameter, below which nothing is marked: of two that
     differ none is the outlier, and of three the spread is hardly known."""
     least_m: float = Field(default=0.003, ge=0)
-    """Positions that are closer than this to the median are never marked, metres."""
+    """Positions that are closer than this to that median are never marked, metres."""
     least_deg: float = Field(default=0.2, ge=0)
     """The same for rotations, degrees."""
     least_ut: float = Field(default=0.3, ge=0)

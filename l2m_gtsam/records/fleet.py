@@ -140,7 +140,7 @@ class Outlier:
     parameter
         Its name and unit: "t_x (mm)".
     deviation
-        From the median of the drives, in that unit.
+        From the median of the usual drives, in that unit.
     score
         The same in units of the uncertainty or of the drives' spread, whichever is larger.
     """
