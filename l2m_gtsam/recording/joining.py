@@ -33,6 +33,7 @@ from l2m_gtsam.recording.saturation import limits_together
 PAUSE_NS = 60_000_000_000
 # In the middle of it the lidar goes from where a drive ended to where the next starts.
 JUMP_NS = 1_000_000
+REPEATED = 10  # values that two drives through one place do not have in common at the same times
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:
@@ -125,8 +126,8 @@ def _check(recordings: Sequence[Recording]) -> None:
     for one, other in combinations(recordings, 2):
         if _same(one, other):
             raise CalibrationError(
-                f"{one.source.path} and {other.source.path} are the same drive, listed twice; "
-                "list each drive once"
+                f"{one.source.path} and {other.source.path} are the same drive, or overlap: the "
+                "same readings are in both; list each drive once, and cut logs where they overlap"
             )
         if _one_way(one, other):
             raise CalibrationError(
@@ -181,18 +182,22 @@ def _overlap(one: FieldSeries, other: FieldSeries) -> bool:
 
 
 def _same(one: Recording, other: Recording) -> bool:
-    """Whether two recordings hold the same drive, in whatever kind of file."""
+    """Whether two recordings hold the same readings, all or some, in whatever kind of file."""
     if one.source.sha256 and one.source.sha256 == other.source.sha256:
         return True
     theirs = {each.sensor: each for each in other.series}
-    pairs = [(each, theirs[each.sensor]) for each in one.series if each.sensor in theirs]
-    return (
-        any(len(each) for each, _ in pairs)
-        and np.array_equal(one.trajectory.stamp_ns, other.trajectory.stamp_ns)
-        and np.array_equal(one.trajectory.p, other.trajectory.p)
-        and all(np.array_equal(a.stamp_ns, b.stamp_ns) for a, b in pairs)
-        and all(np.array_equal(a.field, b.field, equal_nan=True) for a, b in pairs)
-    )
+    return any(_repeated(each, theirs[each.sensor]) for each in one.series if each.sensor in theirs)
+
+
+def _repeated(one: FieldSeries, other: FieldSeries) -> bool:
+    """Whether series have readings in common: most that are of one time, and several values.
+
+    Clocks of two drives may start alike, and a sensor may be stuck on one value in both.
+    """
+    _, mine, theirs = np.intersect1d(one.stamp_ns, other.stamp_ns, return_indices=True)
+    alike = (one.field[mine] == other.field[theirs]).all(axis=1)
+    values = np.unique(one.field[mine[alike]], axis=0)
+    return bool(2 * alike.sum() > len(alike) and len(values) >= REPEATED)
 
 
 def _when(recording: Recording) -> tuple[int, str, str]:

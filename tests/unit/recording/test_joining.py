@@ -215,6 +215,51 @@ def test_parts_of_a_drive_with_one_file_of_poses_are_drives() -> None:
     assert len(joined(halves).drives) == 2
 
 
+def part(whole: Recording, first: int, end: int) -> Recording:
+    """Return a log with some of the poses and readings of a drive."""
+    rows = np.arange(first, end)
+    series = tuple(
+        replace(each, stamp_ns=each.stamp_ns[rows], field=each.field[rows]) for each in whole.series
+    )
+    source = SourceFile(f"{first}_to_{end}.bag", f"digest {first} {end}")
+    return replace(whole, trajectory=whole.trajectory[rows], series=series, source=source)
+
+
+def test_logs_that_overlap_are_refused() -> None:
+    """Their common readings would count twice: sigmas would be too small."""
+    whole = drive(GPS, 0)
+    assert len(joined([part(whole, 0, 25), part(whole, 25, 40)]).drives) == 2
+    for logs in (
+        [part(whole, 0, 25), part(whole, 15, 40)],
+        [whole, part(whole, 5, 30)],
+        [part(whole, 20, 40), drive(2 * GPS, 1), whole],
+    ):
+        with pytest.raises(CalibrationError, match="are the same drive, or overlap: the same"):
+            joined(logs)
+
+
+def test_clocks_that_start_alike_and_stuck_sensors_are_no_overlap() -> None:
+    """Of the same times, and a sensor repeats one value in both, or coarse ones now and then."""
+    first, second = drive(0, 0), drive(0, 1)
+    still = np.ones_like(first.series[0].field)
+    stuck = [
+        replace(each, series=(replace(each.series[0], field=still), each.series[1]))
+        for each in (first, second)
+    ]
+    assert len(joined(stuck).drives) == 2
+    # Steps of 0.3 beside noise of 0.1: few values, many of them alike.
+    coarse = [
+        replace(
+            each,
+            series=tuple(
+                replace(s, field=0.3 * np.round((s.field - k) / 0.3)) for s in each.series
+            ),
+        )
+        for k, each in enumerate((first, second))
+    ]
+    assert len(joined(coarse).drives) == 2
+
+
 @pytest.mark.parametrize(
     ("drives", "pattern"),
     [
