@@ -68,8 +68,8 @@ def compare_halves(first: PartialEstimate, second: PartialEstimate) -> Halves:
     # Cov(b - a) = Cov(a) + Cov(b) - Cov(a, b) - Cov(b, a).
     if first.shared_root is not None and second.shared_root is not None:
         covariance -= first.shared(second) + second.shared(first)
-    turned = _turned(first.vector, second.vector)
-    return _judged(second.vector - first.vector, covariance, turned)
+    a, b = (np.where(part.known, part.vector, np.nan) for part in (first, second))
+    return _judged(b - a, covariance, _turned(a, b))
 
 
 def halves_of(middle: FloatArray, found: HalfDifference) -> Halves:
@@ -119,7 +119,12 @@ def _squared(difference: FloatArray, covariance: FloatArray, taken: BoolArray) -
 
 
 def _turned(first: FloatArray, second: FloatArray) -> float:
-    """Return the angle between the rotations in two calibrations in degrees."""
+    """Return the angle between the rotations in two calibrations in degrees.
+
+    NaN where one leaves C open, or a part of it.
+    """
+    if not np.isfinite([first[3:12], second[3:12]]).all():
+        return float("nan")
     polar = []
     for vector in (first, second):
         U, _, Vt = np.linalg.svd(Distortion.from_vector(vector[3:]).C)

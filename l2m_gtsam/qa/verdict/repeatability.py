@@ -84,15 +84,20 @@ def _negligible(name: str, halves: Halves, options: QaOptions) -> bool:
     """Return whether nobody minds what t, C, H, or all of them, differ by."""
     small = {
         "t": _length(halves.difference[:3]) < options.halves_m,
-        "C": halves.turned_deg < options.halves_deg
-        and max(map(abs, halves.difference[3:12])) < radians(options.halves_deg),
+        "C": not halves.turned_deg >= options.halves_deg
+        and max(map(abs, _known(halves.difference[3:12])), default=0) < radians(options.halves_deg),
         "H": _length(halves.difference[12:]) < options.halves_ut,
     }
     return small.get(name, all(small.values()))
 
 
 def _length(values: Sequence[float]) -> float:
-    return float(sum(each**2 for each in values) ** 0.5)
+    return float(sum(each**2 for each in _known(values)) ** 0.5)
+
+
+def _known(values: Sequence[float]) -> list[float]:
+    """Return what both parts determine of a difference."""
+    return [each for each in values if isfinite(each)]
 
 
 def differing(metrics: SensorMetrics, options: QaOptions) -> Halves | None:
@@ -134,12 +139,18 @@ def _where(metrics: SensorMetrics, options: QaOptions) -> str:
 
 
 def _difference(halves: Halves, where: str, options: QaOptions) -> str:
-    t = ", ".join(f"{1e3 * each:.0f}" for each in halves.difference[:3])
-    H = ", ".join(f"{each:.1f}" for each in halves.difference[12:])
+    t = ", ".join(_rounded(1e3 * each, 0) for each in halves.difference[:3])
+    H = ", ".join(_rounded(each, 1) for each in halves.difference[12:])
     return (
         f"{where} ({t}) mm in place, "
-        f"{halves.turned_deg:.1f}° in rotation and ({H}) µT in H: {_beyond(halves, options)}"
+        f"{_rounded(halves.turned_deg, 1)}° in rotation and ({H}) µT in H: "
+        f"{_beyond(halves, options)}"
     )
+
+
+def _rounded(value: float, digits: int) -> str:
+    """Return a difference with so many digits; a dash for what a part leaves open."""
+    return f"{value:.{digits}f}" if isfinite(value) else "–"
 
 
 def _beyond(halves: Halves, options: QaOptions) -> str:

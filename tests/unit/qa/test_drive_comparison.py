@@ -12,6 +12,8 @@ from l2m_gtsam.qa.metrics.repeatability import (
     compare_drives,
     compare_halves,
 )
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.repeatability import halves_agree
 
 TRUE = np.concatenate([[0.1, 0.2, 0.3], np.eye(3).ravel(), [1.0, 2.0, 3.0]])
 SCALE = np.repeat([1e-3, 1e-3, 1e-1], [3, 9, 3])
@@ -143,3 +145,29 @@ def test_drives_that_say_nothing_are_said() -> None:
     assert reasons[1] == "12 readings are too few"
     assert "determines nothing" in reasons[2]
     assert np.isfinite(found.drives[0].sigma).all()
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_drive_beside_others_that_leave_all_of_a_part_open(count: int) -> None:
+    """As of short loops beside a whole drive: they determine neither z nor the third column of C.
+
+    Nobody else knows these, and the angle between rotations neither.
+    """
+    found = parts(5, count)
+    unknown = [2, 5, 8, 11]
+    for k in range(1, count):
+        covariance = found[k].covariance.copy()
+        covariance[unknown, :] = covariance[:, unknown] = 0
+        covariance[unknown, unknown] = np.inf
+        found[k] = PartialEstimate(found[k].vector, covariance, found[k].shared_root)
+    whole = compare_drives(named(found))
+    for each in whole.drives:
+        known = np.isfinite(each.others.difference)
+        np.testing.assert_array_equal(np.flatnonzero(~known), unknown)
+        assert np.isnan(each.others.turned_deg)
+        assert [(group.name, group.freedom) for group in each.others.distances] == [
+            ("t", 2),
+            ("C", 6),
+            ("H", 3),
+        ]
+    assert halves_agree(whole.drives[0].others, QaOptions())
