@@ -12,11 +12,11 @@ from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.view import QueryableMap, places_of
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
 from l2m_gtsam.options import Options
+from l2m_gtsam.recording.spikes import spikes
 from l2m_gtsam.solve.robust import MEDIAN
 
 LEVER_M = 0.3  # that a rotation counts with along the path
 FEWEST = 3  # readings of an average whose scatter is their noise
-NOISE_SIGMAS = 5.0  # of the length of three axes; noise alone is longer once in 20,000 readings
 MOST_SLOTS = 3000  # of a drive; longer ones are averaged over longer parts
 
 
@@ -82,7 +82,9 @@ def averaged(
         Steel is no nearer to a sensor than this, metres.
     """
     lacking = lacking_field(readings, field_map, estimate)
-    kept = ~spikes(readings, lacking, estimate, nearest)
+    moved = np.linalg.norm(np.diff(places_of(readings, estimate.t), axis=0), axis=1)
+    noise = estimate.noise[readings.sensor]
+    kept = ~spikes(readings.sensor, moved, lacking, noise, nearest)
     readings, used, lacking = readings.select(kept), used[kept], lacking[kept]
     slot = slots_of(readings, estimate, options.step_m)
     key = readings.sensor * (int(slot.max(initial=0)) + 1) + slot
@@ -94,38 +96,6 @@ def averaged(
     within = scatter(readings, lacking - mean[own], count[own])
     noise = np.maximum(within, estimate.noise)
     return Averages(readings[middle], slot[middle], mean, np.bincount(own, used) / count, noise)
-
-
-def spikes(
-    readings: Readings, lacking: FloatArray, estimate: Estimate, nearest: float
-) -> BoolArray:
-    """Return which readings no steel explains: those before and after lack too little, shape (N,).
-
-    A dipole's field is m / r^3 to 2 m / r^3 long. Where its sensor has moved by d the distance is
-    r + d at most, so that at least half of (r / (r + d))^3 of it is left, and r is no less than
-    ``nearest``.
-
-    Parameters
-    ----------
-    readings
-        N of them, of each sensor in order of time.
-    lacking
-        What they have that the map has not, uT, shape (N, 3).
-    estimate
-        Of their sensors.
-    nearest
-        In metres.
-    """
-    size, same = np.linalg.norm(lacking, axis=1), np.diff(readings.sensor) == 0
-    moved = np.linalg.norm(np.diff(places_of(readings, estimate.t), axis=0), axis=1)
-    left = 0.5 * (nearest / (nearest + moved)) ** 3
-    most = size + NOISE_SIGMAS * estimate.noise[readings.sensor]
-    beside = np.zeros((2, len(readings)), dtype=np.bool_)
-    beside[0, 1:] = same & (most[:-1] < left * size[1:])
-    beside[1, :-1] = same & (most[1:] < left * size[:-1])
-    # The first and the last reading of a sensor have one neighbour.
-    ends = ~np.stack([np.append(False, same), np.append(same, False)])
-    return np.asarray((beside | ends).all(axis=0) & beside.any(axis=0))
 
 
 def scatter(readings: Readings, deviation: FloatArray, count: IntArray) -> FloatArray:

@@ -9,19 +9,14 @@ A drift is taken out of the stamps. A map of stamps that drift is bent along the
 10 mm for 50 ms, and in a turn of 1 rad/s the field is turned by three degrees.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
-from l2m_gtsam.data import FloatArray, IntArray, Readings, Recording
-from l2m_gtsam.mapping.options import SuiteCalibrationOptions
-from l2m_gtsam.mapping.suite_likelihood import late_slopes, suite_likelihood, window_slopes
-from l2m_gtsam.mapping.suite_solver import likeness, prior_information
-from l2m_gtsam.mapping.suite_windows import windows_over
-from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
+from l2m_gtsam.data import FloatArray, IntArray, Recording
+from l2m_gtsam.mapping.seen_windows import SeenWindows, scored
+from l2m_gtsam.mapping.suite_likelihood import SIZE, late_slopes
 
 # Of a rate: standard deviations below which it is none. Errors of a drive's poses and waves that
 # are left out err alike for longer than neighbouring readings show.
@@ -56,79 +51,31 @@ class ClockDrifts:
         return np.where(seen & (self.elsewhere > LEAST_ELSEWHERE), self.rates, 0.0)
 
 
-def clock_drifts(
-    readings: Readings, drive: IntArray, sensors: FloatArray, options: SuiteCalibrationOptions
-) -> ClockDrifts:
-    """Return how fast the clocks of a survey's sensors drift, by one step of scoring.
+def clock_drifts(seen: SeenWindows, seconds: FloatArray) -> ClockDrifts:
+    """Return how fast the clocks of a survey's S sensors drift, by one step of scoring.
 
     Parameters
     ----------
-    readings
-        Of the survey at the sensors' clocks, N in number.
-    drive
-        Which of K drives each is of, shape (N,).
-    sensors
-        Parameters of S sensors, shape (S, 16).
-    options
-        Windows, and how far sensors may be from these.
-
-    Raises
-    ------
-    MapError
-        There are too few readings.
+    seen
+        The survey at the sensors' clocks.
+    seconds
+        Since the middle of the drive of each of its readings, shape (N,).
     """
-    windows = windows_over(readings, sensors, NO_SOURCES, options)
-    seconds, known = since_middle(readings.stamp_ns, drive), sensors.size
-    count = known + len(sensors)
-    seen, residuals = [], []
-    for part, rows in zip(windows.parts, windows.rows, strict=True):
-        window = replace(part, readings=readings[rows])
-        at = window_slopes(window, sensors, windows.prior)
-        own = late_slopes(window, at, seconds[rows], len(sensors))
-        slope = suite_likelihood(window, sensors, windows.prior).slope
-        late = np.einsum("ni,nij->j", at.residual, own) / at.noise**2
-        information = at.information(np.concatenate([at.slopes, own], axis=2))
-        seen.append(ScoredWindow(information, np.append(slope, -late)))
-        residuals.append(at.residual)
-    alike = likeness(windows, residuals)
-    prior = np.zeros((count, count))
-    prior[:known, :known] = prior_information(len(sensors), options)
-    prior[np.arange(known, count), np.arange(known, count)] = FASTEST**-2
-    step, sigmas = scored(seen, alike, prior)
+    known = len(seen.prior)
+    sensors = known // SIZE
+    scores = [
+        each.score(late_slopes(each.window, each.at, seconds[rows], sensors))
+        for each, rows in zip(seen.each, seen.windows.rows, strict=True)
+    ]
+    alike = seen.likeness([each.at.residual for each in seen.each])
+    prior = np.diag(np.full(known + sensors, FASTEST**-2))
+    prior[:known, :known] = seen.prior
+    step, sigmas = scored(scores, alike, prior)
     # A survey of one window is judged by that.
-    fewer = combinations(seen, len(seen) - 1) if len(seen) > 1 else [seen]
+    fewer = combinations(scores, len(scores) - 1) if len(scores) > 1 else [scores]
     without = [np.divide(*scored(each, alike, prior)) for each in fewer]
     elsewhere = (np.sign(step) * without).min(axis=0)
     return ClockDrifts(step[known:], sigmas[known:], elsewhere[known:])
-
-
-@dataclass(frozen=True)
-class ScoredWindow:
-    """What a window says of p parameters: information, shape (p, p), and slope, shape (p,)."""
-
-    information: FloatArray
-    slope: FloatArray
-
-
-def scored(
-    windows: Sequence[ScoredWindow], alike: float, prior: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return one step of scoring, shape (p,), and its standard deviations, shape (p,).
-
-    Parameters
-    ----------
-    windows
-        That take part.
-    alike
-        How many neighbouring readings err alike.
-    prior
-        Information about the parameters that is assumed, shape (p, p).
-    """
-    information = np.sum([each.information for each in windows], axis=0) / alike
-    slope = np.sum([each.slope for each in windows], axis=0) / alike
-    factor = cho_factor(information + prior)
-    covariance = cho_solve(factor, np.eye(len(slope)))
-    return cho_solve(factor, slope), np.sqrt(np.diag(covariance))
 
 
 def since_middle(stamp_ns: IntArray, drive: IntArray) -> FloatArray:

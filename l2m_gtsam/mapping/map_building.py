@@ -10,7 +10,9 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.shifts import suite_errors, survey_poses
-from l2m_gtsam.mapping.suite_calibration import refuse_stuck, steady_survey, suite_doubts
+from l2m_gtsam.mapping.steady_survey import steady_survey
+from l2m_gtsam.mapping.suite_calibration import suite_doubts
+from l2m_gtsam.mapping.suite_drive import refuse_stuck
 from l2m_gtsam.maps.build import KINDS, build_map
 from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap, check_frame, framed
@@ -129,7 +131,7 @@ def update_map(
     read = suite_readings(steady.recordings, suite, options.sync, options.pose_noise)
     if isinstance(field_map, HarmonicMap):
         updated = field_map.updated(read.points, read.field, read.suite, read.poses)
-        return updated.doubted(read.doubts)
+        return updated.doubted((*steady.doubts, *read.doubts))
     return field_map.updated(read.points, read.field)
 
 
@@ -159,7 +161,8 @@ def compare_recordings(
     MapError, SyncError
         As in ``map_recordings``, or the readings fill too few patches.
     """
-    read = suite_readings(recordings, suite, options.sync, options.pose_noise)
+    steady = steady_survey(recordings, suite, options.suite)
+    read = suite_readings(steady.recordings, suite, options.sync, options.pose_noise)
     built = dict.fromkeys(options.compare.kinds, 0)
 
     def build(points: FloatArray, field: FloatArray, kind: str) -> FieldMap:

@@ -1,16 +1,17 @@
 """Mapping drives -> the sensors of their suite, with no map and no calibration. Pure."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
 
-from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Recording, SyncCounts
-from l2m_gtsam.errors import CalibrationError, L2MError, MapError
+from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording
+from l2m_gtsam.errors import CalibrationError, L2MError
 from l2m_gtsam.geometry import polar_rotation
-from l2m_gtsam.mapping.clock_drifts import clock_drifts, steadied
 from l2m_gtsam.mapping.options import SuiteCalibrationOptions
+from l2m_gtsam.mapping.steady_survey import FEW, sound_survey, with_steady_sensors
+from l2m_gtsam.mapping.suite_drive import SuiteDrive, suite_drive
 from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU
 from l2m_gtsam.mapping.suite_poses import with_pose_errors
 from l2m_gtsam.mapping.suite_solver import (
@@ -23,10 +24,8 @@ from l2m_gtsam.mapping.suite_solver import (
 )
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.recording.saturation import saturation_doubts
-from l2m_gtsam.recording.sync import stuck_sensors, synchronise, with_offsets
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     SensorCalibration,
@@ -36,43 +35,16 @@ from l2m_gtsam.records.calibration import (
 )
 from l2m_gtsam.solve.noise import residual_figures
 
-REACH = 5.0  # standard deviations of a clock for which readings need poses around them
 NOTICED = 0.1  # share of the residuals' squares; sensors as assumed explain 16 S / 3 N of them
 UNDETERMINED = 0.5  # share of the prior sigma above which the drive does not determine a parameter
 FURTHEST = 6.0  # prior sigmas of a position; beyond, a rough field was taken for a sensor's
 TOGETHER = 1.5  # variance of a direction in sigmas; errors that are independent have one
-FEW = {"windows": 4, "readings": 600, "modes": 200}  # enough to judge sensors and clocks by
 PARAMETERS = (
     *("t_lidar_mag x", "t_lidar_mag y", "t_lidar_mag z"),
     *(f"C[{i},{j}]" for i in range(3) for j in range(3)),
     *("H x", "H y", "H z"),
     "time offset",
 )
-
-
-@dataclass(frozen=True)
-class SteadySurvey:
-    """Drives of a survey whose stamps do not drift, and a sentence for each clock that did."""
-
-    recordings: Sequence[Recording]
-    doubts: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class SuiteDrive:
-    """The drive of a suite: one recording, or several joined, and its readings with poses.
-
-    ``assumed`` are the S sensors' parameters before the survey, shape (S, 16).
-    """
-
-    recording: Recording
-    readings: Readings
-    counts: tuple[SyncCounts, ...]
-    assumed: FloatArray
-
-    def at(self, offset: FloatArray) -> Readings:
-        """Return the readings with the poses at their stamps and these clock offsets, (S,)."""
-        return with_offsets(self.readings, self.recording.trajectory, offset)
 
 
 @one_blas_thread()
@@ -110,10 +82,11 @@ def calibrate_suite(
     SyncError
         Readings and poses do not overlap.
     """
-    drive = suite_drive(recordings, assumed, options)
+    sound = sound_survey(recordings, options)
+    drive = suite_drive(sound.recordings, assumed, options)
     solution = solve_suite(drive.at, drive.assumed, options, progress)
     _check_ending(drive, solution, options)
-    steady = with_steady_clocks(recordings, drive, solution.last.sensors, options)
+    steady = with_steady_sensors(sound.recordings, drive, solution.last.sensors, options)
     if steady.doubts:
         drive = suite_drive(steady.recordings, assumed, options)
         solution = solve_suite(drive.at, drive.assumed, options, progress)
@@ -125,58 +98,10 @@ def calibrate_suite(
         prior_information(len(drive.assumed), options),
     )
     found = _result(drive, replace(solution, last=posed.round), options)
-    found = replace(found, doubts=(*found.doubts, *steady.doubts))
+    found = replace(found, doubts=(*found.doubts, *sound.doubts, *steady.doubts))
     if posed.found is None:
         return found
     return replace(found, doubts=(*found.doubts, posed.found.doubt))
-
-
-@one_blas_thread()
-def steady_survey(
-    recordings: Sequence[Recording],
-    known: Mapping[str, KnownSensor] | None,
-    options: SuiteCalibrationOptions,
-) -> SteadySurvey:
-    """Return drives of calibrated sensors without what their clocks drift by.
-
-    Parameters
-    ----------
-    recordings
-        Drives with poses in one map frame.
-    known, options
-        As in ``suite_doubts``.
-    """
-    few = options.model_copy(update=FEW)
-    try:
-        drive = suite_drive(recordings, known, few)
-        return with_steady_clocks(recordings, drive, drive.assumed, few)
-    except L2MError:  # a survey too small to judge its clocks by
-        return SteadySurvey(recordings)
-
-
-def with_steady_clocks(
-    recordings: Sequence[Recording],
-    drive: SuiteDrive,
-    sensors: FloatArray,
-    options: SuiteCalibrationOptions,
-) -> SteadySurvey:
-    """Return recordings, that a drive joins, without what clocks drift by; sensors are (S, 16)."""
-    parts, readings = drive.recording.parts, drive.at(sensors[:, -1])
-    starts = [
-        part.trajectory.stamp_ns[0] + by - 1
-        for part, by in zip(parts, drive.recording.moved_ns or (0,), strict=True)
-    ]
-    of = np.maximum(np.searchsorted(starts, readings.stamp_ns) - 1, 0)
-    found = clock_drifts(readings, of, sensors, options).found
-    rates = {
-        name: rate for name, rate in zip(readings.sensors, found.tolist(), strict=True) if rate
-    }
-    doubts = tuple(
-        f"the clock of {name} drifts against that of the poses, by {1e5 * rate:.0f} ms in 100 s; "
-        "its stamps were corrected by that. Stamp readings and poses by one clock"
-        for name, rate in rates.items()
-    )
-    return SteadySurvey([steadied(each, rates) for each in recordings], doubts)
 
 
 @one_blas_thread()
@@ -220,37 +145,6 @@ def _largest(step: SuiteStep) -> str:
     """Return the sensor's parameter that moves by the most of its sigmas."""
     sensor, k = np.unravel_index(np.argmax(np.abs(step.sigmas)), step.sigmas.shape)
     return f"{step.names[sensor]}, {PARAMETERS[k]}"
-
-
-def suite_drive(
-    recordings: Sequence[Recording],
-    assumed: Mapping[str, KnownSensor] | None,
-    options: SuiteCalibrationOptions,
-) -> SuiteDrive:
-    """Return drives of a suite as one, with readings that have poses whatever their clocks."""
-    recording = joined(recordings)
-    stated = [abs(each.time_offset) for each in (assumed or {}).values()]
-    reach = REACH * options.clock_s + max(stated, default=0.0)
-    synchronised = synchronise(recording, options.sync, reach)
-    readings = synchronised.readings
-    refuse_stuck(readings, recording)
-    known = [(assumed or {}).get(name, KnownSensor.ideal(name)) for name in readings.sensors]
-    start = np.stack([_parameters(each) for each in known])
-    return SuiteDrive(recording, readings, synchronised.counts, start)
-
-
-def refuse_stuck(readings: Readings, recording: Recording) -> None:
-    """Raise a MapError for a sensor that reports one constant value: it would poison the map."""
-    if stuck := stuck_sensors(readings):
-        raise MapError(
-            f"{recording.source.path}: the sensor {readings.sensors[stuck[0]]!r} is stuck on one "
-            "value; choose the others with `bag.fields`"
-        )
-
-
-def _parameters(sensor: KnownSensor) -> FloatArray:
-    """Return (t, C row by row, H, time offset), shape (16,)."""
-    return np.append(sensor.vector(), sensor.time_offset)
 
 
 def _check_ending(

@@ -125,8 +125,12 @@ def suite_likelihood(
     prior
         Of the field, and the noise.
     """
-    readings, basis, noise = window.readings, window.basis, prior.noise
-    at = window_slopes(window, sensors, prior)
+    return likelihood_at(window, window_slopes(window, sensors, prior), sensors)
+
+
+def likelihood_at(window: SuiteWindow, at: "WindowSlopes", sensors: FloatArray) -> SuiteLikelihood:
+    """Return the same from slopes for these sensors that are known already."""
+    readings, basis, noise = window.readings, window.basis, at.noise
     complexity = _complexity_slopes(basis, at.points, at.scale, at.field, noise)
     r, J = at.residual, at.slopes
     slope = -np.einsum("ni,nij->j", r, J) / noise**2

@@ -7,7 +7,9 @@ import pytest
 
 from l2m_gtsam.data import KnownSensor, Recording
 from l2m_gtsam.mapping.clock_drifts import clock_drifts, since_middle, steadied
-from l2m_gtsam.mapping.suite_calibration import FEW, steady_survey, suite_drive
+from l2m_gtsam.mapping.seen_windows import SeenWindows
+from l2m_gtsam.mapping.steady_survey import FEW, steady_survey
+from l2m_gtsam.mapping.suite_drive import suite_drive
 from tests.drives.suite_surveys import CLOCK, QUICK, suite, surveyed
 from tests.worlds.surveyed import strange_hall
 
@@ -29,7 +31,8 @@ def test_a_clock_that_drifts_is_found_and_no_other(
     drive = suite_drive([off], known, QUICK)
     readings = drive.at(drive.assumed[:, -1])
     one_drive = np.zeros(len(readings), dtype=np.int64)
-    found = clock_drifts(readings, one_drive, drive.assumed, QUICK)
+    seen = SeenWindows.of(readings, drive.assumed, QUICK)
+    found = clock_drifts(seen, since_middle(readings.stamp_ns, one_drive))
     # Stamps that ran slow by a rate are put right by it, but for its square.
     assert found.rates[0] == pytest.approx(RATE, abs=4 * found.sigmas[0])
     assert found.rates[1] == pytest.approx(0, abs=4 * found.sigmas[1])

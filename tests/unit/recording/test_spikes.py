@@ -6,10 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2m_gtsam.calibration.averages import spikes
-from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.data import FieldSeries, FloatArray, Readings, Recording, SourceFile, Trajectory
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
+from l2m_gtsam.recording.spikes import spikes, without_spikes
 
 NOISE_UT = 0.1
 NEAREST_M = 0.2
@@ -27,9 +26,9 @@ def along_a_line(count: int, step_m: float) -> Readings:
 
 
 def shown(readings: Readings, lacking: FloatArray) -> list[int]:
-    ideal = np.tile(np.append(np.eye(3).ravel(), np.zeros(3)), (2, 1))
-    estimate = Estimate(np.zeros((2, 3)), ideal, np.full(2, NOISE_UT), np.zeros(2), np.zeros(2))
-    return np.flatnonzero(spikes(readings, lacking, estimate, NEAREST_M)).tolist()
+    noise = np.full(len(readings), NOISE_UT)
+    moved = np.linalg.norm(np.diff(readings.p_map_lidar, axis=0), axis=1)
+    return np.flatnonzero(spikes(readings.sensor, moved, lacking, noise, NEAREST_M)).tolist()
 
 
 def test_single_spikes_are_found_also_at_the_ends() -> None:
@@ -70,3 +69,44 @@ def test_noise_is_no_spike() -> None:
     assert shown(readings, lacking) == []
     still = replace(readings, p_map_lidar=np.zeros((1000, 3)))
     assert shown(still, lacking) == []
+
+
+def recorded(field: FloatArray, step_m: float) -> Recording:
+    """Return a recording of one sensor on a straight way."""
+    count = len(field)
+    p = np.column_stack([step_m * np.arange(count), np.zeros((count, 2))])
+    stamps = np.arange(count) * 50_000_000
+    poses = Trajectory(stamps, np.tile(np.eye(3), (count, 1, 1)), p, "map", "lidar")
+    series = FieldSeries("a", "/a", "a", stamps, field)
+    return Recording(poses, (series,), SourceFile("drive", ""))
+
+
+def passing_steel(count: int, step_m: float) -> FloatArray:
+    """Return the field of a dipole 30 cm beside the middle of a way, 40 uT at most, with noise."""
+    x = step_m * (np.arange(count) - count / 2)
+    points = np.column_stack([x, np.full(count, 0.3), np.zeros(count)])
+    steel = moment_features(points, np.zeros((1, 3))) @ np.array([0.0, 0.0, 1.0])
+    noise = NOISE_UT * np.random.default_rng(5).standard_normal((count, 3))
+    return np.asarray(40.0 * steel / np.abs(steel).max() + noise)
+
+
+def test_spikes_of_a_recording_are_left_out_and_steel_is_not() -> None:
+    sound = passing_steel(400, 0.035)
+    whole = recorded(sound, 0.035)
+    same, shares = without_spikes(whole, 0.5)
+    assert same is whole
+    assert shares == [0.0]
+    wrong = sound.copy()
+    at = [30, 200, 300, 301]  # in a calm place, beside the steel, and two in a row
+    wrong[at] += [[20.0, 0.0, 0.0], [0.0, -30.0, 0.0], [0.0, 0.0, 15.0], [12.0, -9.0, 0.0]]
+    found, shares = without_spikes(recorded(wrong, 0.035), 0.5)
+    assert shares == [0.01]
+    np.testing.assert_array_equal(found.series[0].field, np.delete(sound, at, axis=0))
+
+
+def test_digits_of_a_sensor_at_rest_are_no_spikes() -> None:
+    """Where nearly all readings are the same their scatter is none."""
+    field = np.full((300, 3), 20.0)
+    field[::20, 0] += 0.15
+    _, shares = without_spikes(recorded(field, 0.0), 0.5)
+    assert shares == [0.0]
