@@ -75,9 +75,9 @@ class SuiteSizes:
         """What that says of the survey."""
         return (
             "the survey's sensors are off by about "
-            f"{1e3 * self.t_m:.1f} mm, {self.C:.2%} of the field and {self.H_ut:.2g} uT each, "
-            "by the survey itself: sigmas include that; calibrate them, and state how well that "
-            "is known (--suite)"
+            f"{1e3 * self.t_m:.1f} mm, {self.C:.2%} of the field, {self.H_ut:.2g} uT and "
+            f"{1e3 * self.offset_s:.2g} ms each, by the survey itself: sigmas "
+            "include that; calibrate them, and state how well that is known (--suite)"
         )
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
-from l2m_gtsam.maps.harmonic.suite_sizes import stated_modes, tile_view
+from l2m_gtsam.maps.harmonic.suite_sizes import SuiteSizes, stated_modes, tile_view
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.solve.variance_components import WeightSystem
@@ -33,6 +33,12 @@ def test_modes_make_the_covariance_and_judged_ones_move_what_is_judged_alone(
     )
     assert found.root.shape[1] == len(found.judged) <= min(size, rank)
     assert not found.root[np.ix_(~judged, found.judged)].any()
+
+
+def test_a_doubt_states_the_clocks_as_well() -> None:
+    """A late clock alone looks like sensors that are off by millimetres."""
+    doubt = SuiteSizes(t_m=0.0241, C=0.0021, H_ut=0.069, offset_s=0.0585).doubt
+    assert "24.1 mm, 0.21% of the field, 0.069 uT and 58 ms each" in doubt
 
 
 def test_without_anything_to_judge_there_are_no_such_modes() -> None:
