@@ -190,7 +190,12 @@ def joint_covariance(
 
     def among(sensors: tuple[int, ...]) -> FloatArray:
         keys = [key for sensor in sensors for key in keys_of(sensor)]
-        joint = marginals.jointMarginalCovariance(keys)
+        try:
+            joint = marginals.jointMarginalCovariance(keys)
+        except RuntimeError as error:
+            if not refused(error):
+                raise
+            return instead(sensors)
         return np.asarray(np.block([[joint.at(a, b) for b in keys] for a in keys]))
 
     return among

@@ -1,7 +1,9 @@
 """The one-key solve on exact maps: truth recovered, forms equal, uncertainty honest."""
 
 from dataclasses import replace
+from functools import partial
 
+import gtsam
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -12,6 +14,7 @@ from l2m_gtsam.calibration.factor_graph import FactorForm
 from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.calibration.optimise import Optimizer, covariance_by_qr, joint_covariance
+from l2m_gtsam.calibration.sensor_columns import keys_of
 from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.records.error_budget import EXPLAINED
@@ -186,3 +189,36 @@ def test_both_ways_to_a_covariance_agree() -> None:
         np.testing.assert_allclose(
             other / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-6
         )
+
+
+def spun_on_the_spot(seed: int, spread: float) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
+    """Return the graph of a sensor that turns in a horizontal field of 20 uT, linearised.
+
+    The vertical field varies by so many uT: the third column of C is hardly known beside H.
+    """
+    rng, N, (t, d, s) = np.random.default_rng(seed), 80, keys_of(0)
+    heading = np.linspace(0, 6, N)
+    b = np.column_stack([20 * np.cos(heading), 20 * np.sin(heading), np.full(N, -43.0)])
+    b[:, 2] += spread * rng.normal(size=N)
+    of_t, of_s = 3 * rng.normal(size=(3 * N, 3)), rng.normal(size=(3 * N, 1))
+    of_C = np.kron(b, np.eye(3))[:, [0, 3, 6, 1, 4, 7, 2, 5, 8]]
+    of_d = np.hstack([of_C, np.tile(np.eye(3), (N, 1))])
+    graph, unit = gtsam.GaussianFactorGraph(), gtsam.noiseModel.Unit.Create
+    blocks = (t, 10 * of_t, d, 10 * of_d, s, 10 * of_s)
+    graph.add(gtsam.JacobianFactor(*blocks, np.zeros(3 * N), unit(3 * N)))
+    graph.add(gtsam.JacobianFactor(s, 1e6 * np.eye(1), np.zeros(1), unit(1)))
+    values = gtsam.Values()
+    for key, size in ((t, 3), (d, 12), (s, 1)):
+        values.insert(key, np.zeros(size))
+    return graph, values
+
+
+def test_where_gtsam_refuses_a_covariance_it_is_that_by_qr() -> None:
+    """Near its limit it refuses some systems at once, and others when it is asked for marginals."""
+    for spread in np.geomspace(0.010, 0.0115, 5):
+        for seed in range(30):
+            linear, values = spun_on_the_spot(seed, float(spread))
+            by_qr = partial(covariance_by_qr, linear)
+            sigma = np.sqrt(np.diag(joint_covariance(linear, values, by_qr)((0,))))
+            # Cholesky beside QR, with a condition of 1e4 and so one of 1e8 of the normal equations
+            np.testing.assert_allclose(sigma, np.sqrt(np.diag(by_qr((0,)))), rtol=1e-3)
