@@ -35,6 +35,9 @@ FIGURES = "figures"
 """Stage of the figures of a calibration and its picture."""
 STEPS = 1  # alternation from where the whole was found; the joint graph does the rest
 MORE = 4  # times as many readings of a drive as of a half
+FAR = (
+    2.0  # times as strong as of the whole, or as weak: an open C that is further off is no sensor's
+)
 
 
 @one_blas_thread()
@@ -154,12 +157,14 @@ def halves_anew(
     Each starts where the whole was found, with its time offsets and processes and without priors:
     what a half leaves open takes no part. Readings that the whole rejected are looked at again.
     """
-    readings, t = _usable(calibrated), calibrated.solution.estimate.t
+    readings, whole = _usable(calibrated), calibrated.solution.estimate
     middle, budget = np.median(readings.stamp_ns), calibrated.solution.budget
     parts = (readings.stamp_ns < middle, readings.stamp_ns >= middle)
     try:
         first, second = in_threads(
-            lambda part: _parts(calibrated, readings.select(part), t, options, each_half, budget),
+            lambda part: _parts(
+                calibrated, readings.select(part), whole.t, whole.C(), options, each_half, budget
+            ),
             parts,
         )
     except (CalibrationError, np.linalg.LinAlgError) as error:
@@ -192,10 +197,10 @@ def compared_drives(
     """
     readings, count = _usable(calibrated), len(recording.drives)
     solved = [found.sensor for found in calibrated.solution.solved]
-    own = by_drive(readings, count)
-    t = np.repeat(calibrated.solution.estimate.t, count, axis=0)
+    own, whole = by_drive(readings, count), calibrated.solution.estimate
+    t, C = (np.repeat(each, count, axis=0) for each in (whole.t, whole.C()))
     try:
-        found = _parts(calibrated, own, t, options, MORE * each_half)
+        found = _parts(calibrated, own, t, C, options, MORE * each_half)
     except (CalibrationError, np.linalg.LinAlgError) as error:
         found, failed = {}, f"the drives cannot be calibrated by themselves: {error}"
     else:
@@ -241,23 +246,45 @@ def _parts(
     calibrated: Calibrated,
     readings: Readings,
     t: FloatArray,
+    C: FloatArray,
     options: CalibrationOptions,
     most: int,
     budget: Budget = NOTHING_FOUND,
 ) -> dict[int, PartialEstimate]:
-    """Return what some of the readings determine of each sensor that they are enough for."""
+    """Return what some of the readings determine of each sensor that they are enough for.
+
+    Parameters
+    ----------
+    t, C
+        Of the whole, of every sensor of the readings: metres, shapes (S, 3) and (S, 3, 3).
+    """
     few = readings.select(spread(readings, max(most, options.solve.min_readings)))
     near = options.solve.model_copy(update={"max_steps": min(STEPS, options.solve.max_steps)})
     if duration := calibrated.solution.pose_duration:
         lasting = near.pose_noise.lasting(duration.seconds)
         near = near.model_copy(update={"pose_noise": lasting})
     solution = solve_part(few, calibrated.solver_map, t, near, budget)
-    return {
+    parts = {
         found.sensor: PartialEstimate(
             solution.estimate.vector(found.sensor), found.covariance, found.shared_root
         )
         for found in solution.solved
     }
+    return {sensor: _near(part, C[sensor]) for sensor, part in parts.items()}
+
+
+def _near(part: PartialEstimate, C: FloatArray) -> PartialEstimate:
+    """Return a part, or that it determines nothing where what it leaves open of C went astray.
+
+    Its other parameters, and their sigmas, are those beside a C that no sensor has.
+    """
+    if part.known[3:12].all():
+        return part
+    ratio = np.linalg.solve(C.T, part.vector[3:12].reshape(3, 3).T)
+    strengths = np.linalg.svd(ratio, compute_uv=False)
+    if strengths[0] < FAR and strengths[-1] > 1 / FAR:
+        return part
+    return replace(part, covariance=np.diag(np.full(len(part.vector), np.inf)))
 
 
 def _compared(

@@ -214,6 +214,17 @@ def test_a_drive_too_short_is_said() -> None:
         assert "usable readings in this drive are too few" in text
 
 
+def test_a_turn_on_the_spot_is_no_movement_of_a_sensor() -> None:
+    """It leaves the third column of C open, and t beside a C that no sensor has says nothing."""
+    path = poses(np.linspace(0, 6.2, 200), at_height(np.zeros(200), np.zeros(200)))
+    later = replace(path, stamp_ns=path.stamp_ns + DAY_NS)
+    found = made(monday(), recorded("spot", later, 5))
+    assert found.verdict.level is Level.PASS
+    for sensor in found.verdict.sensors:
+        (note,) = sensor.reasons
+        assert note.text.startswith("spot.bag is not compared with the other drives: this drive")
+
+
 def test_a_sensor_that_is_in_one_drive_only_is_calibrated_from_it() -> None:
     first, second = monday(), tuesday()
     second = replace(second, series=second.series[:2])
