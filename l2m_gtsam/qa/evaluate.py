@@ -35,9 +35,7 @@ FIGURES = "figures"
 """Stage of the figures of a calibration and its picture."""
 STEPS = 1  # alternation from where the whole was found; the joint graph does the rest
 MORE = 4  # times as many readings of a drive as of a half
-FAR = (
-    2.0  # times as strong as of the whole, or as weak: an open C that is further off is no sensor's
-)
+FAR = 2.0  # times as strong as the whole's, or as weak: an open C beyond that is no sensor's
 
 
 @one_blas_thread()
