@@ -23,6 +23,7 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.options import SuiteCalibrationOptions
 from l2m_gtsam.mapping.seen_windows import SeenWindow, SeenWindows, WindowScore
 from l2m_gtsam.mapping.suite_likelihood import SIZE, H
+from l2m_gtsam.solve.chi_square import quantile
 
 MOMENTS = 20  # at which a jump is tried at once
 FEWEST = 20  # readings of the sensor in the windows before a jump, and after
@@ -33,6 +34,9 @@ ANYTHING_UT = 100.0  # standard deviation of a jump before the survey
 LEAST_GAIN = 60.0
 # Without any one window, of the same change: steel that came or went is in one place alone.
 LEAST_ELSEWHERE = 15.0
+# Of what windows, each by itself, may differ by: steel that came looks otherwise in each, and a
+# drift is another change in places that are visited at other times.
+ALIKE = 0.99
 NEAR_M = 1.0  # from where the vehicle was when H jumped: there its moment is looked for closely
 CLOSE = {"windows": 8, "readings": 3000}
 SETTLED_S = 0.5  # between the readings that a jump lies between
@@ -375,7 +379,7 @@ class JudgedJump:
 
 
 def shown_gain(seen: SeenWindows, tried: TriedJump) -> float:
-    """Return what a jump explains; nothing if that is in one place alone."""
+    """Return what a jump explains; nothing if it is not the same everywhere."""
     judged = JudgedJump.of(seen, tried)
     scores, alike = judged.scores, judged.alike
     fewer = combinations(scores, len(scores) - 1) if len(scores) > 1 else ()
@@ -383,7 +387,19 @@ def shown_gain(seen: SeenWindows, tried: TriedJump) -> float:
         found = explained(each, seen.prior, alike)
         if found.gain < LEAST_ELSEWHERE or np.sum(found.change * tried.change) <= 0:
             return 0.0
+    single = [explained([each], seen.prior, alike) for each in scores]
+    if differing(single) > quantile(ALIKE, tried.change.size * max(len(scores) - 1, 1)):
+        return 0.0
     return explained(scores, seen.prior, alike).gain
+
+
+def differing(found: Sequence[ExplainedJump]) -> float:
+    """Return the sum of squares of what changes of windows differ by, in their sigmas."""
+    changes = [each.change.ravel() for each in found]
+    known = [cho_solve(cho_factor(e.covariance), np.eye(len(e.covariance))) for e in found]
+    pull = np.sum([P @ c for P, c in zip(known, changes, strict=True)], axis=0)
+    mean = np.linalg.solve(np.sum(known, axis=0), pull)
+    return float(sum((c - mean) @ P @ (c - mean) for P, c in zip(known, changes, strict=True)))
 
 
 def jumping(seen: SeenWindows, tried: TriedJump) -> IntArray:

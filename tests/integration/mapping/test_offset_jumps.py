@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
-from l2m_gtsam.mapping.offset_jumps import SurveyJump, with_more, without_jumps
+from l2m_gtsam.mapping.offset_jumps import (
+    ExplainedJump,
+    SurveyJump,
+    differing,
+    with_more,
+    without_jumps,
+)
 from l2m_gtsam.mapping.steady_survey import steady_survey
 from tests.drives.suite_surveys import CLOCK, QUICK, suite, surveyed
 from tests.worlds.surveyed import strange_hall
@@ -111,3 +117,16 @@ def test_the_stamps_of_a_drive_are_its_own(
     np.testing.assert_allclose(own, np.where((stamps >= at)[:, None], -JUMP_UT, 0.0), atol=1e-9)
     before = changes(without_jumps(recording, [jump], 0), recording)["mag_00"]
     assert not before.any()
+
+
+def test_windows_differ_by_their_changes_in_sigmas() -> None:
+    """By two unequal ones: (a - b)^T (A + B)^-1 (a - b), nothing if they are the same."""
+    rng = np.random.default_rng(3)
+    roots = rng.standard_normal((2, 3, 3))
+    first, second = (root @ root.T for root in roots)
+    a, b = rng.standard_normal((2, 1, 3))
+    nothing = np.zeros(16)
+    found = [ExplainedJump(1.0, nothing, a, first), ExplainedJump(1.0, nothing, b, second)]
+    expected = float((a - b)[0] @ np.linalg.solve(first + second, (a - b)[0]))
+    assert differing(found) == pytest.approx(expected, rel=1e-6)
+    assert differing([found[0], found[0]]) == pytest.approx(0.0, abs=1e-9)
