@@ -138,6 +138,8 @@ class QaOptions(Options):
     unexplained: Limit = Limit(warn=0.5, fail=0.75)
     """What the calibration leaves of the readings beside what a uniform field would leave (0 is
     all explained, 1 nothing): above it the map does not fit the drive."""
+    warp_m: float = Field(default=0.5, gt=0)
+    """A drive's frame that is bent against the map's by more is of another place, metres: FAIL."""
     rejected: Limit = Limit(warn=0.02, fail=1 / 3)
     """Share of the readings inside the map that no distortion explains."""
     outside_map: Limit = Limit(warn=0.3, fail=0.9)

@@ -29,7 +29,7 @@ from l2m_gtsam.records.calibration import (
     SensorStatus,
     Uncertainty,
 )
-from l2m_gtsam.records.error_budget import DurationSource
+from l2m_gtsam.records.error_budget import DisturbanceKind, DurationSource
 from l2m_gtsam.records.metrics import Measures, SensorMetrics
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
 from l2m_gtsam.text import significant
@@ -101,7 +101,8 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
     # A map of another place is no evidence on this one.
     reasons += disturbance_reasons(result, None)
     reasons += stated_wrongly(result.stated, None, result.pose_duration)
-    return _wrong_map(cases) or [*_on_drive(cases), *reasons, *_exact(result)]
+    elsewhere = _wrong_map(cases) or _bent_too_far(cases, result)
+    return elsewhere or [*_on_drive(cases), *reasons, *_exact(result)]
 
 
 def _old_map(result: CalibrationResult, options: QaOptions) -> list[Reason]:
@@ -145,6 +146,19 @@ def _wrong_map(cases: tuple[Case, ...]) -> list[Reason]:
     if not known or not all(map(misfit, known)):
         return []
     return [Reason(Level.FAIL, WRONG_MAP)]
+
+
+def _bent_too_far(cases: tuple[Case, ...], result: CalibrationResult) -> list[Reason]:
+    """Return that a drive fits the map only if its frame is bent as none is."""
+    warps = [each for each in result.disturbances if each.kind is DisturbanceKind.WARP]
+    size = max((each.sizes["shift_m"] for each in warps), default=0.0)
+    if not cases or size <= cases[0].options.warp_m:
+        return []
+    text = (
+        f"The drive fits the map only if its frame is bent by {size:.2g} m, more than a frame of "
+        "one place is (`qa.warp_m`). Is it the map of this place, and are the poses in its frame?"
+    )
+    return [Reason(Level.FAIL, text)]
 
 
 def _on_drive(cases: tuple[Case, ...]) -> list[Reason]:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.qa.verdict.uncertainty import disturbance_reasons, stated_wrongly
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.error_budget import (
@@ -18,6 +20,7 @@ from l2m_gtsam.records.error_budget import (
 )
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.record_files import read_metrics
 
 FILE = Path(__file__).parents[2] / "files" / "calibration.yaml"
 
@@ -62,6 +65,19 @@ def test_what_steers_matters_beside_the_sigma_of_H(size: float, level: Level) ->
     found = Disturbance(DisturbanceKind.MOVING_PARTS, steering, gain=50.0, sensor=name)
     (reason,) = disturbance_reasons(replace(with_share(0.05), disturbances=(found,)), name)
     assert reason.level is level
+
+
+@pytest.mark.parametrize(("size", "fails"), [(0.02, False), (1.2, True)])
+def test_a_frame_that_is_bent_by_more_than_half_a_metre_is_of_another_place(
+    size: float, fails: bool
+) -> None:
+    found = Disturbance(DisturbanceKind.WARP, {"shift_m": size}, gain=500.0)
+    result = replace(read_calibration(FILE), disturbances=(found,))
+    metrics = read_metrics(FILE.with_name("metrics.json"))
+    told = judge(result, metrics, QaOptions()).reasons
+    of_bend = [each for each in told if "Is it the map of this place" in each.text]
+    assert [each.level for each in of_bend] == ([Level.FAIL] if fails else [])
+    assert (told == tuple(of_bend)) is fails
 
 
 def test_sizes_of_errors_of_poses_are_told_with_the_duration_that_is_assumed() -> None:
