@@ -10,10 +10,11 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.mapping.clock_drifts import clock_drifts, since_middle, steadied
-from l2m_gtsam.mapping.offset_jumps import SurveyJump, jumps_of, refined, with_more, without_jumps
+from l2m_gtsam.mapping.offset_jumps import jumps_of, refined
 from l2m_gtsam.mapping.options import SuiteCalibrationOptions
 from l2m_gtsam.mapping.seen_windows import SeenWindows
 from l2m_gtsam.mapping.suite_drive import SuiteDrive, suite_drive
+from l2m_gtsam.mapping.survey_jump import SurveyJump, with_more, without_jumps
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.recording.joining import drive_at, own_ns
 from l2m_gtsam.recording.spikes import without_spikes

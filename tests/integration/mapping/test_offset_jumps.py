@@ -6,14 +6,9 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
-from l2m_gtsam.mapping.offset_jumps import (
-    ExplainedJump,
-    SurveyJump,
-    differing,
-    with_more,
-    without_jumps,
-)
+from l2m_gtsam.mapping.offset_jumps import ExplainedJump, differing
 from l2m_gtsam.mapping.steady_survey import steady_survey
+from l2m_gtsam.mapping.survey_jump import SurveyJump, with_more, without_jumps
 from tests.drives.suite_surveys import CLOCK, QUICK, suite, surveyed
 from tests.worlds.surveyed import strange_hall
 
