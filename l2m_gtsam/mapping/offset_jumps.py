@@ -365,7 +365,7 @@ def closely(
     Parameters
     ----------
     readings, sensors, options
-        As of ``jump_of``.
+        As of ``jumps_of``.
     found
         Between two readings that are seconds apart.
     """

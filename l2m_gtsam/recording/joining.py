@@ -194,9 +194,11 @@ def _repeated(one: FieldSeries, other: FieldSeries) -> bool:
 
     Clocks of two drives may start alike, and a sensor may be stuck on one value in both.
     """
-    _, mine, theirs = np.intersect1d(one.stamp_ns, other.stamp_ns, return_indices=True)
-    alike = (one.field[mine] == other.field[theirs]).all(axis=1)
-    values = np.unique(one.field[mine[alike]], axis=0)
+    _, at, there = np.intersect1d(one.stamp_ns, other.stamp_ns, return_indices=True)
+    mine, theirs = one.field[at], other.field[there]
+    read = np.isfinite(mine).all(axis=1)  # of some sensors half of all are not
+    alike = (mine[read] == theirs[read]).all(axis=1)
+    values = np.unique(mine[read][alike], axis=0)
     return bool(2 * alike.sum() > len(alike) and len(values) >= REPEATED)
 
 

@@ -54,8 +54,8 @@ class RowBlocks:
     @classmethod
     def of(cls, matrix: csr_array | FloatArray) -> "RowBlocks":
         """Return a matrix in blocks."""
-        each = (_full_columns(matrix, rows) for rows in _slices(matrix.shape[0]))
-        return cls(tuple(RowBlock(*block) for block in each), matrix.shape[1])
+        blocks = tuple(_block(matrix, rows) for rows in _slices(matrix.shape[0]))
+        return cls(blocks, matrix.shape[1])
 
     def toarray(self) -> FloatArray:
         """Return the matrix as it is, shape (m, n)."""
@@ -83,9 +83,9 @@ class RowBlocks:
         """Return the matrix with more columns, shape (m, k)."""
         blocks = []
         for each in self.blocks:
-            _, at, values = _full_columns(columns, each.rows)
-            wider = np.concatenate([each.columns, self.width + at])
-            blocks.append(RowBlock(each.rows, wider, np.hstack([each.values, values])))
+            more = _block(columns, each.rows)
+            wider = np.concatenate([each.columns, self.width + more.columns])
+            blocks.append(RowBlock(each.rows, wider, np.hstack([each.values, more.values])))
         return RowBlocks(tuple(blocks), self.width + columns.shape[1])
 
     def at(self, rows: IntArray) -> "RowBlocks":
@@ -107,11 +107,9 @@ def _slices(rows: int) -> Iterator[slice]:
         yield slice(first, min(first + ROWS, rows))
 
 
-def _full_columns(
-    matrix: csr_array | FloatArray, rows: slice
-) -> tuple[slice, IntArray, FloatArray]:
-    """Return rows of a matrix, and the columns in which they are not all zero with their values."""
+def _block(matrix: csr_array | FloatArray, rows: slice) -> RowBlock:
+    """Return rows of a matrix in the columns in which they are not all zero."""
     own = matrix[rows]
     values = np.asarray(own.toarray() if isinstance(own, csr_array) else own)
     at = np.flatnonzero(values.any(axis=0))
-    return rows, at, values if len(at) == values.shape[1] else values[:, at]
+    return RowBlock(rows, at, values if len(at) == values.shape[1] else values[:, at])

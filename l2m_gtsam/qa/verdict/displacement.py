@@ -81,8 +81,8 @@ def _displacements(found: Displacement) -> list[CalibrationChange]:
 def _moved_by(found: Displacement, axes: str) -> str:
     """Return a displacement along the axes of a frame as a phrase."""
     verbs = {CalibrationPart.PLACE: "moved", CalibrationPart.ROTATION: "turned"}
-    ways = {CalibrationPart.PLACE: "along", CalibrationPart.ROTATION: "about"}
+    relations = {CalibrationPart.PLACE: "along", CalibrationPart.ROTATION: "about"}
     return " and ".join(
-        f"{verbs[each.part]} by {size_and_parts(each)} {ways[each.part]} the {axes}'s x, y, z"
+        f"{verbs[each.part]} by {size_and_parts(each)} {relations[each.part]} the {axes}'s x, y, z"
         for each in _displacements(found)
     )

@@ -238,6 +238,17 @@ def test_logs_that_overlap_are_refused() -> None:
             joined(logs)
 
 
+def test_copies_of_a_log_with_missing_readings_are_refused() -> None:
+    """Of some drivers every second message is not a number."""
+    whole = drive(GPS, 0)
+    field = whole.series[0].field.copy()
+    field[::2] = np.nan
+    one = replace(whole, series=(replace(whole.series[0], field=field),))
+    copy = replace(one, source=SourceFile("copy.mcap", "another digest"))
+    with pytest.raises(CalibrationError, match="are the same drive, or overlap"):
+        joined([one, copy])
+
+
 def test_clocks_that_start_alike_and_stuck_sensors_are_no_overlap() -> None:
     """Of the same times, and a sensor repeats one value in both, or coarse ones now and then."""
     first, second = drive(0, 0), drive(0, 1)

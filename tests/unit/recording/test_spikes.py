@@ -16,7 +16,7 @@ STEP_M = 0.05
 
 
 def along_a_line(count: int, step_m: float) -> Readings:
-    """Return readings of nothing of two sensors, one after the other, on a straight way."""
+    """Return readings of nothing of two sensors, one after the other, on a straight path."""
     x = step_m * np.arange(count)
     p = np.tile(np.column_stack([x, np.zeros((count, 2))]), (2, 1))
     stamps = np.tile(np.arange(count) * 100_000_000, 2)
@@ -72,7 +72,7 @@ def test_noise_is_no_spike() -> None:
 
 
 def recorded(field: FloatArray, step_m: float) -> Recording:
-    """Return a recording of one sensor on a straight way."""
+    """Return a recording of one sensor on a straight path."""
     count = len(field)
     p = np.column_stack([step_m * np.arange(count), np.zeros((count, 2))])
     stamps = np.arange(count) * 50_000_000
@@ -82,7 +82,7 @@ def recorded(field: FloatArray, step_m: float) -> Recording:
 
 
 def passing_steel(count: int, step_m: float) -> FloatArray:
-    """Return the field of a dipole 30 cm beside the middle of a way, 40 uT at most, with noise."""
+    """Return the field of a dipole 30 cm beside the middle of a path, 40 uT at most, with noise."""
     x = step_m * (np.arange(count) - count / 2)
     points = np.column_stack([x, np.full(count, 0.3), np.zeros(count)])
     steel = moment_features(points, np.zeros((1, 3))) @ np.array([0.0, 0.0, 1.0])
