@@ -31,6 +31,7 @@ def said(
     sources: tuple[float, ...] = (),
     displaced: tuple[Displaced, ...] = (),
     jumps: int = 0,
+    drifts: int = 0,
 ) -> Any:
     """What a validation found: parts of each sensor, and sources so far from the steel.
 
@@ -39,6 +40,7 @@ def said(
     return SimpleNamespace(
         displacement=SimpleNamespace(of=displaced) if displaced else None,
         jumps=(None,) * jumps,
+        drifts=(None,) * drifts,
         sensors=[
             SimpleNamespace(changes=[SimpleNamespace(part=p) for p in each]) for each in parts
         ],
@@ -67,6 +69,7 @@ NONE: tuple[set[CalibrationPart], ...] = (set(), set())
         (TrueCause.TURNED, said({TURN}, set(), displaced=(Displaced.LIDAR,)), False),
         (TrueCause.NOTHING, said(*NONE, displaced=(Displaced.LIDAR,)), False),
         (TrueCause.NOTHING, said(*NONE, jumps=1), False),
+        (TrueCause.NOTHING, said(*NONE, drifts=1), False),
         (TrueCause.TURNED, said({TURN, IRON}, {TURN}), False),
         (TrueCause.IRON, said({IRON}, {IRON}), True),
         (TrueCause.IRON, said({IRON}, {IRON, MOVE}), False),
