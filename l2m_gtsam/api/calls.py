@@ -30,7 +30,6 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
 from l2m_gtsam.errors import InputError
-from l2m_gtsam.mapping.map_building import map_recordings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.field_map import FieldMap
@@ -45,6 +44,7 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
 from l2m_gtsam.storage.known_sensors import read_known_sensors
 from l2m_gtsam.upkeep.kept_map import kept_up
+from l2m_gtsam.upkeep.surveys import map_surveys
 
 Values = Mapping[str, Any]
 Structure = npt.ArrayLike | str | Path | None
@@ -57,8 +57,12 @@ def build_map(
     *,
     structure: Structure = None,
     options: MappingOptions | Values | None = None,
+    changes: ChangesOptions | Values | None = None,
 ) -> FieldMap:
     """Build a map of the magnetic field from one or several surveys.
+
+    Each is compared with those before it. Where steel came or went between them, the map is of the
+    place as the last one found it, and has a ``diary``.
 
     Parameters
     ----------
@@ -71,6 +75,8 @@ def build_map(
         What the LiDAR saw of steel: points in the map frame in metres, shape (M, 3), or a file.
     options
         As under `mapping` in a configuration.
+    changes
+        As under `calibration.changes`: how steel is looked for that came or went.
 
     Raises
     ------
@@ -82,7 +88,8 @@ def build_map(
     chosen = options_of(MappingOptions, options, "mapping")
     if structure is not None:
         refuse_structure(chosen.model.kind)
-    return map_recordings(drives, known, chosen, _cloud(structure, chosen))
+    steel = options_of(ChangesOptions, changes, "calibration.changes")
+    return map_surveys(drives, known, chosen, steel, _cloud(structure, chosen))
 
 
 def keep_map_up(

@@ -11,7 +11,7 @@ from l2m_gtsam.batch.survey import MappingDrives, read_survey, scanned_place
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.map_building import compare_recordings, map_recordings, update_map
+from l2m_gtsam.mapping.map_building import compare_recordings, update_map
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary, Remembering
@@ -20,6 +20,7 @@ from l2m_gtsam.records.map_diary import MapDiary
 from l2m_gtsam.records.provenance import MapOrigin
 from l2m_gtsam.storage.map_file import save_map
 from l2m_gtsam.upkeep.kept_map import drive_dates, kept_up
+from l2m_gtsam.upkeep.surveys import map_surveys
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,13 @@ def build_map_file(
     survey = read_survey(bags, config, suite, structure, progress)
     scanned = scanned_place(bags, survey.recordings, config, progress) if lidar else None
     with reported("building the map", progress):
-        field_map = map_recordings(survey.recordings, survey.suite, config.mapping, survey.cloud)
+        field_map = map_surveys(
+            survey.recordings,
+            survey.suite,
+            config.mapping,
+            config.calibration.changes,
+            survey.cloud,
+        )
     provenance = {
         "bags": [vars(recording.source) for recording in survey.recordings],
         "suite": None if suite is None else used_file(suite, survey.suite_level),

@@ -10,7 +10,7 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.shifts import suite_errors, survey_poses
-from l2m_gtsam.mapping.steady_survey import steady_survey
+from l2m_gtsam.mapping.steady_survey import SteadySurvey, steady_survey
 from l2m_gtsam.mapping.suite_calibration import suite_doubts
 from l2m_gtsam.mapping.suite_drive import refuse_stuck
 from l2m_gtsam.maps.build import KINDS, build_map
@@ -90,6 +90,17 @@ def map_recordings(
         Readings and poses of a recording do not overlap.
     """
     steady = steady_survey(recordings, suite, options.suite)
+    return map_of(steady, suite, options, cloud)
+
+
+@one_blas_thread()
+def map_of(
+    steady: SteadySurvey,
+    suite: Mapping[str, KnownSensor] | None,
+    options: MappingOptions,
+    cloud: FloatArray | None = None,
+) -> FieldMap:
+    """Build a map from drives that are corrected already; otherwise as ``map_recordings``."""
     recordings = steady.recordings
     read = suite_readings(recordings, suite, options.sync, options.pose_noise)
     field_map = build_map(read.points, read.field, options.model, cloud, read.suite, read.poses)

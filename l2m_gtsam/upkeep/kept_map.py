@@ -16,14 +16,19 @@ from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected
 from l2m_gtsam.calibration.coverage import errors_over_stated
 from l2m_gtsam.calibration.drive_sources import drive_sources
 from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.sensor_columns import SENSOR
+from l2m_gtsam.calibration.view import places_of
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import SurveyReadings, suite_readings
 from l2m_gtsam.mapping.options import MappingOptions
+from l2m_gtsam.mapping.steady_survey import steady_survey
 from l2m_gtsam.maps.field_map import FieldMap, check_frame
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.renewal import DriveReadings, renewed
+from l2m_gtsam.maps.sources.found_sources import price
+from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.source import UT_M3, SourceShape
 from l2m_gtsam.maps.training import additional_set
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -53,6 +58,11 @@ class SeenSources:
     sources: tuple[ChangedSource, ...]
     gain: float
     vehicle: float
+
+    @property
+    def of_vehicle(self) -> bool:
+        """Whether it was the sensors that changed, rather than the place."""
+        return self.vehicle > max(self.gain, 0.0) + CLEAR
 
 
 def estimate_of(known: Sequence[KnownSensor], noise: float) -> Estimate:
@@ -84,6 +94,10 @@ def seen_sources(
         How to look.
     """
     estimate = estimate_of(known, field_map.learnt.hyperparameters.noise)
+    # Where no reading of the map is near, what it misses is no change.
+    readings = readings.select(field_map.query(places_of(readings, estimate.t)).inside)
+    if not len(readings):
+        return SeenSources((), 0.0, 0.0)
     every = np.ones(len(readings), dtype=np.bool_)
     nearest = options.sources.nearest
     averages = averaged(readings, field_map, estimate, every, options.averaging, nearest)
@@ -95,7 +109,17 @@ def seen_sources(
     free = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
     rows = with_calibration(free, covariances(known))
     shown = drive_sources(rows, drive, places, field_map, options.sources)
-    return SeenSources(shown.changed(), shown.gain, vehicle_gain(shown.rows, drive))
+    vehicle = max(vehicle_gain(shown.rows, drive), calibration_gain(rows, free, len(known)))
+    return SeenSources(shown.changed(), shown.gain, vehicle)
+
+
+def calibration_gain(known: MarginalRows, free: MarginalRows, sensors: int) -> float:
+    """Return what other calibrations of so many sensors explain (a BIC).
+
+    The rows are of sensors as they are calibrated, and of any sensors.
+    """
+    as_calibrated, as_any = (each.pull(each.residual)[1] for each in (known, free))
+    return as_calibrated - as_any - price(free, SENSOR * sensors)
 
 
 def covariances(known: Sequence[KnownSensor]) -> FloatArray:
@@ -164,21 +188,56 @@ def after_drive(
 ) -> HarmonicMap:
     """Return a map after one drive; see ``kept_up``."""
     history = field_map.learnt.history
-    diary = MapDiary((survey,)) if history is None else history.diary
-    check_order(recording, drive, diary)
-    read = suite_readings([recording], suite, options.sync)
-    known = [suite[series.sensor] for series in recording.series]
-    offset = np.array([each.time_offset for each in known])
-    readings = synchronise(recording, options.sync, float(np.abs(offset).max())).readings
-    readings = with_offsets(readings, recording.trajectory, offset)
-    seen = seen_sources(readings, known, field_map.compile(), changes)
-    if seen.vehicle > max(seen.gain, 0.0) + CLEAR:
+    check_order(recording, drive, MapDiary((survey,)) if history is None else history.diary)
+    steady = steady_survey([recording], suite, options.suite)
+    (recording,) = steady.recordings
+    seen = shown_by(recording, field_map, suite, options, changes)
+    if seen.of_vehicle:
         raise MapError(
             f"{recording.source.path}: its sensors do not read as they are calibrated, wherever "
             "they are; see `l2m validate`, and calibrate them anew"
         )
+    given = drive, suite, options, seen, survey
+    return with_drive(field_map, recording, *given).doubted(steady.doubts)
+
+
+def shown_by(
+    recording: Recording,
+    field_map: HarmonicMap,
+    suite: Mapping[str, KnownSensor],
+    options: MappingOptions,
+    changes: ChangesOptions,
+) -> SeenSources:
+    """Return what a drive shows beside a map."""
+    readings, known = read_by(recording, suite, options)
+    return seen_sources(readings, known, field_map.compile(), changes)
+
+
+def with_drive(
+    field_map: HarmonicMap,
+    recording: Recording,
+    drive: MapDrive,
+    suite: Mapping[str, KnownSensor],
+    options: MappingOptions,
+    seen: SeenSources,
+    survey: MapDrive,
+) -> HarmonicMap:
+    """Return a map after a drive that shows some sources; otherwise as ``after_drive``."""
+    history = field_map.learnt.history
+    diary = MapDiary((survey,)) if history is None else history.diary
+    read = suite_readings([recording], suite, options.sync)
     found = dated_changes(field_map, seen.sources, diary)
     return renewed(field_map, drive_readings(read, drive), found, survey).doubted(read.doubts)
+
+
+def read_by(
+    recording: Recording, suite: Mapping[str, KnownSensor], options: MappingOptions
+) -> tuple[Readings, list[KnownSensor]]:
+    """Return the readings of a drive at the clocks of its sensors, and these."""
+    known = [suite[series.sensor] for series in recording.series]
+    offset = np.array([each.time_offset for each in known])
+    readings = synchronise(recording, options.sync, float(np.abs(offset).max())).readings
+    return with_offsets(readings, recording.trajectory, offset), known
 
 
 def drive_readings(read: SurveyReadings, drive: MapDrive) -> DriveReadings:

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.data import Distortion, KnownSensor, Recording
-from l2m_gtsam.mapping.map_building import map_recordings
 from l2m_gtsam.mapping.options import MappingOptions, SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import silent
 from l2m_gtsam.studies.slam_array.robot import SENSORS
+from l2m_gtsam.upkeep.surveys import map_surveys
 
 
 def map_by(passes: Sequence[Recording]) -> FieldMap:
@@ -28,4 +29,4 @@ def map_by(passes: Sequence[Recording]) -> FieldMap:
     known = KnownSensor(
         SENSORS[0], sensor.t_lidar_mag, sensor.distortion, offset.seconds, covariance
     )
-    return map_recordings(alone, {SENSORS[0]: known}, MappingOptions())
+    return map_surveys(alone, {SENSORS[0]: known}, MappingOptions(), ChangesOptions())

@@ -17,13 +17,14 @@ import pytest
 from l2m_gtsam.api import calls
 from l2m_gtsam.batch import drives, maps
 from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
+from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording, SourceFile
-from l2m_gtsam.mapping.map_building import map_recordings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.field_map import FieldMap, Summarised
 from l2m_gtsam.progress import Progress, silent
+from l2m_gtsam.upkeep.surveys import map_surveys
 from tests.support.made_once import made_once
 
 Found = TypeVar("Found")
@@ -51,12 +52,13 @@ def computed_once(factory: pytest.TempPathFactory) -> Iterator[None]:
         recordings: Sequence[Recording],
         suite: Mapping[str, KnownSensor] | None,
         options: MappingOptions,
+        changes: ChangesOptions,
         cloud: FloatArray | None = None,
     ) -> FieldMap:
         read = [readings_of(each) for each in recordings]
         points = None if cloud is None else hashlib.sha256(cloud.tobytes()).hexdigest()
-        key = ("map", read, suite, options, points)
-        return once(key, lambda: map_recordings(recordings, suite, options, cloud))
+        key = ("map", read, suite, options, changes, points)
+        return once(key, lambda: map_surveys(recordings, suite, options, changes, cloud))
 
     def solved(
         recording: Recording,
@@ -72,7 +74,7 @@ def computed_once(factory: pytest.TempPathFactory) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         for module in (calls, maps):
-            patch.setattr(module, "map_recordings", mapped)
+            patch.setattr(module, "map_surveys", mapped)
         for module in (calls, drives):
             patch.setattr(module, "calibrated", solved)
         yield

@@ -111,6 +111,8 @@ def shared_noise(learnt: Learnt, rows: IntArray, gradient: FloatArray | None) ->
     if learnt.poses is None or gradient is None:
         return None
     effects = learnt.poses.knots(rows, gradient)
+    if not effects.white.shape[2]:  # the poses of these readings count as exact
+        return None
     return SharedNoise(effects.white, learnt.readings.weight[rows], learnt.hyperparameters.noise)
 
 
