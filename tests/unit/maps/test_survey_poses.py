@@ -328,6 +328,16 @@ def test_more_readings_keep_the_errors_of_the_old_ones(posed: HarmonicMap) -> No
     assert len(unknown.reading) == len(posed.learnt.poses.reading)
 
 
+def test_readings_with_exact_poses_may_be_where_no_others_are(posed: HarmonicMap) -> None:
+    away = np.array([20.0, 0.0, 0.0])  # in tiles of their own
+    points, field = posed.readings.points[:40] + away, posed.readings.field[:40]
+    found = posed.updated(points, field).query(points)
+    assert found.inside.all()
+    assert rms(found.field - field) < 2 * TILT * float(
+        np.linalg.norm(EARTH)
+    )  # these are tilted, too
+
+
 @pytest.mark.parametrize(
     ("name", "change"),
     [
