@@ -203,7 +203,7 @@ def suite_readings(
         raise MapError(msg)
     drives = []
     for recording in recordings:
-        known = [_known(series.sensor, suite, recording) for series in recording.series]
+        known = [listed_sensor(series.sensor, suite, recording) for series in recording.series]
         offset = np.array([each.time_offset for each in known])
         synchronised = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0)))
         readings = synchronised.readings
@@ -236,7 +236,10 @@ def map_fields(readings: Readings, known: Sequence[KnownSensor]) -> FloatArray:
     return np.asarray(np.einsum("nij,nj->ni", readings.R_map_lidar, b_lidar))
 
 
-def _known(name: str, suite: Mapping[str, KnownSensor] | None, recording: Recording) -> KnownSensor:
+def listed_sensor(
+    name: str, suite: Mapping[str, KnownSensor] | None, recording: Recording
+) -> KnownSensor:
+    """Return a sensor of a recording as its suite has it; a MapError if that does not list it."""
     if suite is None:
         return KnownSensor.ideal(name)
     if name not in suite:

@@ -20,7 +20,7 @@ from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.view import places_of
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.map_building import SurveyReadings, suite_readings
+from l2m_gtsam.mapping.map_building import SurveyReadings, listed_sensor, suite_readings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.steady_survey import steady_survey
 from l2m_gtsam.maps.field_map import FieldMap, check_frame
@@ -234,7 +234,7 @@ def read_by(
     recording: Recording, suite: Mapping[str, KnownSensor], options: MappingOptions
 ) -> tuple[Readings, list[KnownSensor]]:
     """Return the readings of a drive at the clocks of its sensors, and these."""
-    known = [suite[series.sensor] for series in recording.series]
+    known = [listed_sensor(series.sensor, suite, recording) for series in recording.series]
     offset = np.array([each.time_offset for each in known])
     readings = synchronise(recording, options.sync, float(np.abs(offset).max())).readings
     return with_offsets(readings, recording.trajectory, offset), known
