@@ -31,7 +31,10 @@ PLACES = np.random.default_rng(3).uniform([-2.5, -1.5, 0.37], [-0.3, 1.5, 0.43],
 
 @dataclass(frozen=True)
 class Kept:
-    """Maps of the yard's west: of its survey, with steel that was brought, and without it again."""
+    """Maps of the yard's west: of its survey, with steel that was brought, and without it again.
+
+    And the drives of these.
+    """
 
     folder: Path
     config: Path
@@ -39,6 +42,8 @@ class Kept:
     surveyed: Path
     brought: Path
     taken: Path
+    drives: tuple[Path, ...]
+    cloud: Path
 
 
 @pytest.fixture(scope="module")
@@ -46,18 +51,17 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Kept:
     folder = tmp_path_factory.mktemp("kept")
     yard, suite = make_yard(folder), folder / "suite.yaml"
     suite.write_text(json.dumps({"sensors": {"mag": {"t_lidar_mag": [0, 0, 0]}}}))
-    found = Kept(
-        folder, yard.config, suite, *(folder / f"{name}.npz" for name in ("first", "more", "less"))
-    )
-    given = ("--config", yard.config, "--suite", suite)
-    l2m("map", "build", yard.west, *given, "--structure", yard.cloud, "--out", found.surveyed)
     path, steel = route(-3, 0.5), with_steel(STEEL, MOMENT)
-    drives = [
+    drives = (
+        yard.west,
         survey(folder, "second", path, 5, steel, START + DAY),
         survey(folder, "third", path, 6, None, START + 2 * DAY),
-    ]
-    maps = (found.surveyed, found.brought, found.taken)
-    for before, drive, after in zip(maps[:-1], drives, maps[1:], strict=True):
+    )
+    maps = [folder / f"{name}.npz" for name in ("first", "more", "less")]
+    found = Kept(folder, yard.config, suite, maps[0], maps[1], maps[2], drives, yard.cloud)
+    given = ("--config", yard.config, "--suite", suite)
+    l2m("map", "build", yard.west, *given, "--structure", yard.cloud, "--out", found.surveyed)
+    for before, drive, after in zip(maps[:-1], drives[1:], maps[1:], strict=True):
         l2m("map", "update", before, drive, *given, "--changes", "--out", after)
     return found
 
@@ -86,6 +90,16 @@ def test_what_came_and_went_is_told(kept: Kept) -> None:
     # A cloud need not show all steel: what came may as well have gone.
     assert "or steel of the opposite moment went" in out
     assert "2023-11-15 and 2023-11-16" in out
+
+
+def test_a_survey_of_all_drives_tells_the_same(kept: Kept) -> None:
+    path = kept.folder / "together.npz"
+    given = ("--config", kept.config, "--suite", kept.suite, "--structure", kept.cloud)
+    out = l2m("map", "build", *reversed(kept.drives), *given, "--out", path).out
+    assert "What changed: 2 drives since the survey (2023-11-14)" in out
+    one, other = opened(path), opened(kept.taken)
+    np.testing.assert_array_equal(one.query(PLACES).field, other.query(PLACES).field)
+    assert str(one.diary) == str(other.diary)
 
 
 def test_without_a_cloud_it_came_or_went(kept: Kept) -> None:
