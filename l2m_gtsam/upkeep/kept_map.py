@@ -26,10 +26,10 @@ from l2m_gtsam.mapping.steady_survey import steady_survey
 from l2m_gtsam.maps.field_map import FieldMap, check_frame
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.renewal import DriveReadings, renewed
+from l2m_gtsam.maps.harmonic.renewal import DriveReadings, renewed, shape_of
 from l2m_gtsam.maps.sources.found_sources import price
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.maps.sources.source import UT_M3, SourceShape
+from l2m_gtsam.maps.sources.source import UT_M3
 from l2m_gtsam.maps.training import additional_set
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.recording.sync import synchronise, with_offsets
@@ -329,8 +329,7 @@ def last_detected(field_map: HarmonicMap, source: ChangedSource) -> int:
     history, points = field_map.learnt.history, field_map.readings.points
     if history is None:
         return 0
-    shape = SourceShape(np.concatenate([source.position, source.moment, source.half_axis]))
-    strength = np.linalg.norm(shape.field_and_gradient(points)[0], axis=1)
+    strength = np.linalg.norm(shape_of(source).field_and_gradient(points)[0], axis=1)
     detected = strength > max(DETECTED_UT, DETECTED_SHARE * float(strength.max()))
     return int(history.drive[detected].max(initial=0))
 

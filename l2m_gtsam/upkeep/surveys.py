@@ -1,135 +1,17 @@
-"""A map of several drives of a survey, between which the place may have changed.
-
-Steel that stands in some of the drives alone is neither in the place nor out of it: a map of all
-readings alike is wrong near it, and blames sensors and poses. Each drive is therefore asked what it
-shows beside a map of those before it. Where that is steel, the map is kept up from then on: it is
-of the place as the last drive found it.
-"""
+"""Surveys -> the map of a place as the last of them found it. Pure: no files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
 
 from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
-from l2m_gtsam.errors import L2MError
-from l2m_gtsam.mapping.map_building import map_of, suite_readings
+from l2m_gtsam.mapping.map_building import map_of
 from l2m_gtsam.mapping.options import MappingOptions
-from l2m_gtsam.mapping.steady_survey import SteadySurvey, steady_survey
+from l2m_gtsam.mapping.steady_survey import steady_survey
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.parallel.threads import one_blas_thread
-from l2m_gtsam.upkeep.kept_map import SeenSources, drive_dates, shown_by, with_drive
-
-# Twice a logarithm of likelihood. At its edges a map of coarse waves misses 0.2 A m^2 of steel that
-# is not there, by 50 of it; a fork lift beside the path has 10^5.
-LEAST_GAIN = 100.0
-
-
-@dataclass(frozen=True)
-class SurveyDrives:
-    """Drives of a survey in the order of their time, and the sensors that are assumed."""
-
-    steady: SteadySurvey
-    suite: Mapping[str, KnownSensor]
-    options: MappingOptions
-    changes: ChangesOptions
-
-    @classmethod
-    def of(
-        cls,
-        steady: SteadySurvey,
-        suite: Mapping[str, KnownSensor] | None,
-        options: MappingOptions,
-        changes: ChangesOptions,
-    ) -> "SurveyDrives":
-        """Return drives in order; sensors of which nothing is known are ideal."""
-        recordings = sorted(steady.recordings, key=lambda each: int(each.trajectory.stamp_ns[0]))
-        names = {series.sensor for each in recordings for series in each.series}
-        known = {name: KnownSensor.ideal(name) for name in names} if suite is None else suite
-        return cls(replace(steady, recordings=recordings), known, options, changes)
-
-    def first(self, count: int) -> SteadySurvey:
-        """Return the drives before others."""
-        return replace(self.steady, recordings=self.steady.recordings[:count])
-
-    def mapped(self, count: int, cloud: FloatArray | None) -> FieldMap:
-        """Return a map of so many drives."""
-        return map_of(self.first(count), self.suite, self.options, cloud)
-
-    def unlike(self, cloud: FloatArray | None) -> "Unlike | None":
-        """Return the first drive that differs from those before it, if any does."""
-        recordings = self.steady.recordings
-        try:
-            field_map = self.mapped(1, cloud)
-        except L2MError:  # too little by itself to tell
-            return None
-        for number, recording in enumerate(recordings[1:], start=1):
-            if not isinstance(field_map, HarmonicMap):
-                break
-            seen = self.shown(recording, field_map)
-            if max(seen.gain, seen.vehicle) > LEAST_GAIN and (seen.sources or seen.of_vehicle):
-                return Unlike(number, seen, field_map)
-            given = [recording], self.suite, self.options.sync, self.options.pose_noise
-            read = suite_readings(*given)
-            field_map = field_map.updated(read.points, read.field, read.suite, read.poses)
-        return None
-
-    def shown(self, recording: Recording, field_map: HarmonicMap) -> SeenSources:
-        """Return what a drive shows beside a map of others."""
-        return shown_by(recording, field_map, self.suite, self.options, self.changes)
-
-    def kept_up(self, first: "Unlike", cloud: FloatArray | None) -> FieldMap:
-        """Return a map of the drives before one that differs, after that one and all later."""
-        recordings, number = self.steady.recordings, first.number
-        seen: SeenSources | None = first.seen
-        survey = drive_dates(*recordings[:number])
-        # A map of one drive is that already; one that was updated has the prior of the first.
-        field_map = first.field_map if number == 1 else self.mapped(number, cloud)
-        for each in recordings[number:]:
-            if not isinstance(field_map, HarmonicMap):
-                break
-            seen = seen or self.shown(each, field_map)
-            if seen.of_vehicle:
-                return self.doubted(each, cloud)
-            given = drive_dates(each), self.suite, self.options, seen, survey
-            field_map, seen = with_drive(field_map, each, *given), None
-        return field_map
-
-    def doubted(self, recording: Recording, cloud: FloatArray | None) -> FieldMap:
-        """Return a map of all drives, one of which sensors read otherwise."""
-        field_map = self.mapped(len(self.steady.recordings), cloud)
-        if not isinstance(field_map, HarmonicMap):
-            return field_map
-        name = Path(recording.source.path).name
-        return field_map.doubted(
-            (
-                (
-                    f"the sensors read otherwise in {name} than in the drives before it, wherever "
-                    "they are: something of the vehicle changed. Calibrate them anew (`l2m map "
-                    "suite`), or survey by drives of one and the same vehicle"
-                ),
-            )
-        )
-
-
-@dataclass(frozen=True)
-class Unlike:
-    """A drive that differs from those before it.
-
-    Attributes
-    ----------
-    number
-        Of the drive.
-    seen
-        What it shows beside them.
-    field_map
-        That they make.
-    """
-
-    number: int
-    seen: SeenSources
-    field_map: FieldMap
+from l2m_gtsam.upkeep.survey_change import parted
+from l2m_gtsam.upkeep.survey_drives import SurveyDrives
 
 
 @one_blas_thread()
@@ -147,7 +29,8 @@ def map_surveys(
     recordings, suite, options, cloud
         As of ``mapping.map_building.map_recordings``.
     changes
-        How steel is looked for that came or went between drives.
+        How steel is looked for that came or went between drives, or during a single one that its
+        map does not explain.
 
     Raises
     ------
@@ -155,8 +38,22 @@ def map_surveys(
         As in ``map_recordings``.
     """
     steady = steady_survey(recordings, suite, options.suite)
-    if len(recordings) == 1 or options.model.kind != HarmonicMap.kind:
+    if options.model.kind != HarmonicMap.kind:
         return map_of(steady, suite, options, cloud)
     drives = SurveyDrives.of(steady, suite, options, changes)
+    if len(recordings) == 1:
+        field_map = drives.mapped(1, cloud)
+        if not (isinstance(field_map, HarmonicMap) and is_unexplained(field_map)):
+            return field_map
+        both = parted(drives, cloud)
+        first = None if both is None else both.unlike(cloud)
+        return field_map if both is None or first is None else both.kept_up(first, cloud)
     first = drives.unlike(cloud)
-    return map_of(steady, suite, options, cloud) if first is None else drives.kept_up(first, cloud)
+    return drives.mapped(len(recordings), cloud) if first is None else drives.kept_up(first, cloud)
+
+
+def is_unexplained(field_map: HarmonicMap) -> bool:
+    """Return whether a map does not explain its readings, or only by sensors that are off."""
+    learnt = field_map.learnt
+    off = learnt.suite is not None and not learnt.suite.stated
+    return off or bool(learnt.origin.explanation.reasons)

@@ -23,6 +23,7 @@ from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.records.map_diary import DatedChange, FadedStretch, MapDrive
+from l2m_gtsam.records.places import ChangedSource
 
 LEAST_SIZE_M = 0.06  # half of the extent that steel has at least
 CHANGED_M = 0.4  # so near a change, structures are others since
@@ -82,13 +83,12 @@ def corrected(learnt: Learnt, changes: Sequence[DatedChange], count: int) -> Lea
     """Return the same, its first so many readings with the field of what changed after them."""
     field, points = learnt.readings.field.copy(), learnt.readings.points[:count]
     for change in changes:
-        field[:count] += shape_of(change).field_and_gradient(points)[0]
+        field[:count] += shape_of(change.source).field_and_gradient(points)[0]
     return replace(learnt, readings=replace(learnt.readings, field=field))
 
 
-def shape_of(change: DatedChange) -> SourceShape:
-    """Return the source of a change."""
-    source = change.source
+def shape_of(source: ChangedSource) -> SourceShape:
+    """Return a source that changed as its field is made of it."""
     return SourceShape(np.concatenate([source.position, source.moment, source.half_axis]))
 
 
