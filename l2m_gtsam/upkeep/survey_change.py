@@ -22,7 +22,7 @@ from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.renewal import shape_of
 from l2m_gtsam.recording.splitting import split_at
 from l2m_gtsam.upkeep.kept_map import SeenSources, read_by
-from l2m_gtsam.upkeep.survey_drives import LEAST_GAIN, SurveyDrives
+from l2m_gtsam.upkeep.survey_drives import LEAST_GAIN, SurveyDrives, halves
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,8 @@ def parted(drives: SurveyDrives, cloud: FloatArray | None) -> SurveyDrives | Non
         Structure in the map frame in metres, shape (M, 3), if there is any.
     """
     (recording,) = drives.steady.recordings
-    first, last = recording.trajectory.stamp_ns[[0, -1]].tolist()
-    halves = split_at(recording, (first + last) // 2)
-    mapped = [mapped_half(drives, *pair, cloud) for pair in (halves, halves[::-1])]
+    both = halves(recording)
+    mapped = [mapped_half(drives, *pair, cloud) for pair in (both, both[::-1])]
     gains = [0.0 if each is None else each.seen.gain for each in mapped]
     later = int(np.argmax(gains))
     found = mapped[later]

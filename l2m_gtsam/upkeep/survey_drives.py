@@ -13,11 +13,12 @@ from pathlib import Path
 from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
 from l2m_gtsam.errors import L2MError
-from l2m_gtsam.mapping.map_building import map_of, suite_readings
+from l2m_gtsam.mapping.map_building import SurveyReadings, map_of, suite_readings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.steady_survey import SteadySurvey
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.recording.splitting import split_at
 from l2m_gtsam.upkeep.kept_map import SeenSources, drive_dates, shown_by, with_drive
 
 # Twice a logarithm of likelihood. At its edges a map of coarse waves misses 0.2 A m^2 of steel that
@@ -59,6 +60,12 @@ class SurveyDrives:
     def mapped(self, count: int, cloud: FloatArray | None) -> FieldMap:
         """Return a map of so many drives."""
         return map_of(self.first(count), self.suite, self.options, cloud)
+
+    def read(self) -> list[SurveyReadings]:
+        """Return what each drive read, or each half of a single one."""
+        recordings = self.steady.recordings
+        parts = recordings if len(recordings) > 1 else halves(recordings[0])
+        return [suite_readings([each], self.suite, self.options.sync) for each in parts]
 
     def unlike(self, cloud: FloatArray | None) -> "Unlike | None":
         """Return the first drive that differs from those before it, if any does."""
@@ -114,6 +121,12 @@ class SurveyDrives:
                 ),
             )
         )
+
+
+def halves(recording: Recording) -> tuple[Recording, Recording]:
+    """Return the halves of a drive by time."""
+    first, last = recording.trajectory.stamp_ns[[0, -1]].tolist()
+    return split_at(recording, (first + last) // 2)
 
 
 @dataclass(frozen=True)

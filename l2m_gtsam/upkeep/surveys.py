@@ -10,6 +10,7 @@ from l2m_gtsam.mapping.steady_survey import steady_survey
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.upkeep.agreement import is_kept_well, saw_one_field
 from l2m_gtsam.upkeep.survey_change import parted
 from l2m_gtsam.upkeep.survey_drives import SurveyDrives
 
@@ -29,8 +30,8 @@ def map_surveys(
     recordings, suite, options, cloud
         As of ``mapping.map_building.map_recordings``.
     changes
-        How steel is looked for that came or went between drives, or during a single one that its
-        map does not explain.
+        How steel is looked for that came or went between drives, or during a single one: where
+        their readings of one place differ.
 
     Raises
     ------
@@ -41,19 +42,33 @@ def map_surveys(
     if options.model.kind != HarmonicMap.kind:
         return map_of(steady, suite, options, cloud)
     drives = SurveyDrives.of(steady, suite, options, changes)
-    if len(recordings) == 1:
-        field_map = drives.mapped(1, cloud)
-        if not (isinstance(field_map, HarmonicMap) and is_unexplained(field_map)):
-            return field_map
-        both = parted(drives, cloud)
-        first = None if both is None else both.unlike(cloud)
-        return field_map if both is None or first is None else both.kept_up(first, cloud)
-    first = drives.unlike(cloud)
-    return drives.mapped(len(recordings), cloud) if first is None else drives.kept_up(first, cloud)
+    field_map = drives.mapped(len(recordings), cloud)
+    if not isinstance(field_map, HarmonicMap) or saw_one_field(field_map, drives.read()):
+        return field_map
+    several = drives if len(recordings) > 1 else parted(drives, cloud)
+    first = None if several is None else several.unlike(cloud)
+    if several is None or first is None:
+        # Errors of sensors and poses that were found, or stated, are in the sigmas.
+        counted = field_map.learnt.poses is not None or field_map.learnt.suite is not None
+        return field_map if counted else field_map.doubted((differing(len(recordings)),))
+    kept = several.kept_up(first, cloud)
+    if isinstance(kept, HarmonicMap) and not is_kept_well(kept):
+        return kept.doubted((STILL_DIFFERING,))
+    return kept
 
 
-def is_unexplained(field_map: HarmonicMap) -> bool:
-    """Return whether a map does not explain its readings, or only by sensors that are off."""
-    learnt = field_map.learnt
-    off = learnt.suite is not None and not learnt.suite.stated
-    return off or bool(learnt.origin.explanation.reasons)
+STILL_DIFFERING = (
+    "beside the steel that came or went during the survey, readings of one place before and after "
+    "it still differ by more than noise: sigmas near it are too small; survey again while nothing "
+    "moves"
+)
+
+
+def differing(drives: int) -> str:
+    """Return that readings of one place differ, and no steel explains it."""
+    parts = "the drives" if drives > 1 else "both halves"
+    return (
+        f"readings of one place differ between {parts} of the survey by more than noise: poses, "
+        "clocks or sensors were others, or something small moved, and sigmas are too small; "
+        "localise all on one point cloud, and survey while nothing moves"
+    )

@@ -6,11 +6,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.changed_places import ChangesOptions
-from l2m_gtsam.data import Distortion, KnownSensor, Recording
+from l2m_gtsam.data import Distortion, KnownSensor, Recording, joined_rows
 from l2m_gtsam.mapping.map_building import map_recordings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
+from l2m_gtsam.records.map_diary import MapDiary
+from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.upkeep.surveys import map_surveys
 from tests.drives.suite_surveys import CLOCK, QUICK, suite, surveyed
 from tests.worlds.exact import DipoleWorld
@@ -58,16 +60,18 @@ def mapped(*drives: Recording) -> HarmonicMap:
     return found
 
 
+def strongest(diary: MapDiary) -> ChangedSource:
+    """Return the largest change; a map of coarse waves may show 0.2 A m^2 that are not there."""
+    sources = [each.source for each in diary.changes]
+    return max(sources, key=lambda each: float(np.linalg.norm(each.moment)))
+
+
 def test_steel_between_two_drives_is_named_and_the_map_is_of_the_last() -> None:
     first, second = (drive(2 + k, k, world, SENSORS) for k, world in enumerate((EMPTY, LOADED)))
     field_map = mapped(second, first)  # in the order of their stamps, however they are given
     assert field_map.diary is not None
     assert [each.day for each in field_map.diary.drives] == ["2023-11-14", "2023-11-15"]
-    # Beside it a map of coarse waves may show 0.2 A m^2 that are not there.
-    found = max(
-        (each.source for each in field_map.diary.changes),
-        key=lambda each: float(np.linalg.norm(each.moment)),
-    )
+    found = strongest(field_map.diary)
     away = float(np.linalg.norm(found.position - STEEL))
     assert away < max(0.1, 4 * float(np.linalg.norm(found.position_sigma)))  # no other place
     # Sigmas of a map hold to a third in halls of which so little is known; of both alike it is
@@ -76,6 +80,20 @@ def test_steel_between_two_drives_is_named_and_the_map_is_of_the_last() -> None:
     plain = map_recordings([first, second], KNOWN, OPTIONS)
     assert isinstance(plain, HarmonicMap)
     assert errors(plain, LOADED) > 2 * errors(field_map, LOADED)
+
+
+def test_steel_that_comes_during_a_drive_is_named_as_well() -> None:
+    early, late = (drive(2 + k, k, world, SENSORS) for k, world in enumerate((EMPTY, LOADED)))
+    whole = replace(
+        early,
+        trajectory=joined_rows([early.trajectory, late.trajectory]),
+        series=tuple(joined_rows([a, b]) for a, b in zip(early.series, late.series, strict=True)),
+    )
+    field_map = mapped(whole)
+    assert field_map.diary is not None
+    found = strongest(field_map.diary)
+    assert np.linalg.norm(found.position - STEEL) < 0.2
+    assert errors(field_map, LOADED) < 1.4
 
 
 def test_drives_of_one_place_make_the_map_of_all_of_them() -> None:

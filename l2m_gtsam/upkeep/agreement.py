@@ -1,0 +1,87 @@
+r"""Whether parts of a survey saw one field, by what a map of all of them leaves of each.
+
+In a square of the floor, the means of the residuals of K parts with n_k readings each differ by
+chance alone if
+
+.. math::
+    \sum_k n_k |\bar e_k - \bar e|^2 / \sigma^2 \sim \chi^2_{3 (K - 1)}
+
+A map follows whatever its readings have in common, so that of one field the sum over all squares is
+rather smaller. Steel that came or went makes it several times as large, and so do poses and clocks
+that are off: it tells that there is something to look for.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.mapping.map_building import SurveyReadings
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.solve.chi_square import quantile
+
+CELL_M = 1.0
+FEWEST = 4  # readings of a part in a square: whatever is wrong with one hardly moves their mean
+SURE = 0.999
+
+
+def saw_one_field(field_map: HarmonicMap, parts: Sequence[SurveyReadings]) -> bool:
+    """Return whether the readings of parts differ by no more than chance makes them.
+
+    Parameters
+    ----------
+    field_map
+        Made of all of them.
+    parts
+        Two or more.
+    """
+    lengths = [len(each.points) for each in parts]
+    points, field = (
+        np.concatenate([getattr(each, name) for each in parts]) for name in ("points", "field")
+    )
+    readings = TrainingSet(points, field, np.ones(len(points)))
+    return is_one_field(field_map, readings, np.repeat(np.arange(len(parts)), lengths))
+
+
+def is_kept_well(field_map: HarmonicMap) -> bool:
+    """Return whether drives, each with what changed after it, differ by no more than chance."""
+    learnt = field_map.learnt
+    return learnt.history is None or is_one_field(field_map, learnt.readings, learnt.history.drive)
+
+
+def is_one_field(field_map: HarmonicMap, readings: TrainingSet, part: IntArray) -> bool:
+    """Return the same of readings whose parts have a number each, shape (N,)."""
+    known, noise = field_map.query(readings.points), field_map.learnt.hyperparameters.noise
+    white = (readings.field - known.field) / noise
+    at = np.flatnonzero(known.inside)
+    squares, freedom = between_parts(readings[at], white[at], part[at])
+    return not freedom or bool(squares < quantile(SURE, freedom))
+
+
+def between_parts(readings: TrainingSet, white: FloatArray, part: IntArray) -> tuple[float, int]:
+    """Return the sum of squares between the means of parts, and its degrees of freedom.
+
+    Parameters
+    ----------
+    readings
+        N of them.
+    white
+        What a map leaves of them, in sigmas of a reading of weight one, shape (N, 3).
+    part
+        To which each belongs, shape (N,).
+    """
+    weight, cells = readings.weight, np.floor(readings.points[:, :2] / CELL_M)
+    cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    group, of = np.unique(np.column_stack([cell, part]), axis=0, return_inverse=True)
+    of = of.ravel()
+    enough = np.bincount(of) >= FEWEST
+    if not enough.any():
+        return 0.0, 0
+    n = np.bincount(of, weight)[enough]
+    total = np.stack([np.bincount(of, weight * axis) for axis in white.T], axis=1)[enough]
+    _, at, count = np.unique(group[enough, 0], return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(at, axis) for axis in total.T], axis=1)
+    mean = sums / np.bincount(at, n)[:, None]
+    apart = total / n[:, None] - mean[at]
+    return float(np.sum(n[:, None] * apart**2)), 3 * int(np.sum(count - 1))

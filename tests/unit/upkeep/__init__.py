@@ -1,0 +1,1 @@
+"""Maps that are kept up, piece by piece."""
