@@ -201,22 +201,29 @@ def suite_readings(
         named = ", ".join(f"{r.source.path} in {r.trajectory.frame!r}" for r in recordings)
         msg = f"the recordings' poses are in different frames: {named}; one map frame is needed"
         raise MapError(msg)
-    drives = []
-    for recording in recordings:
-        known = [listed_sensor(series.sensor, suite, recording) for series in recording.series]
-        offset = np.array([each.time_offset for each in known])
-        synchronised = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0)))
-        readings = synchronised.readings
-        refuse_stuck(readings, recording)
-        readings = with_offsets(readings, recording.trajectory, offset)
-        points, field = sensor_positions(readings, known), map_fields(readings, known)
-        poses = survey_poses(recording.trajectory, readings, points, field, pose_noise)
-        doubts = saturation_doubts(readings.sensors, synchronised.counts)
-        errors = suite_errors(readings, known)
-        drives.append(SurveyReadings(points, field, errors, poses, doubts))
+    drives = [survey_readings(each, suite, sync, pose_noise) for each in recordings]
     read = reduce(SurveyReadings.followed_by, drives)
     checked_readings(read.points, read.field)
     return read
+
+
+def survey_readings(
+    recording: Recording,
+    suite: Mapping[str, KnownSensor] | None,
+    sync: SyncOptions,
+    pose_noise: PoseNoiseOptions | None = None,
+) -> SurveyReadings:
+    """Return what a suite read in one drive, however little, in the order of its readings."""
+    known = [listed_sensor(series.sensor, suite, recording) for series in recording.series]
+    offset = np.array([each.time_offset for each in known])
+    synchronised = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0)))
+    readings = synchronised.readings
+    refuse_stuck(readings, recording)
+    readings = with_offsets(readings, recording.trajectory, offset)
+    points, field = sensor_positions(readings, known), map_fields(readings, known)
+    poses = survey_poses(recording.trajectory, readings, points, field, pose_noise)
+    doubts = saturation_doubts(readings.sensors, synchronised.counts)
+    return SurveyReadings(points, field, suite_errors(readings, known), poses, doubts)
 
 
 def sensor_positions(readings: Readings, known: Sequence[KnownSensor]) -> FloatArray:

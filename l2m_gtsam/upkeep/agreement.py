@@ -11,12 +11,9 @@ rather smaller. Steel that came or went makes it several times as large, and so 
 that are off: it tells that there is something to look for.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.mapping.map_building import SurveyReadings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.solve.chi_square import quantile
@@ -26,24 +23,6 @@ FEWEST = 4  # readings of a part in a square: whatever is wrong with one hardly 
 SURE = 0.999
 
 
-def saw_one_field(field_map: HarmonicMap, parts: Sequence[SurveyReadings]) -> bool:
-    """Return whether the readings of parts differ by no more than chance makes them.
-
-    Parameters
-    ----------
-    field_map
-        Made of all of them.
-    parts
-        Two or more.
-    """
-    lengths = [len(each.points) for each in parts]
-    points, field = (
-        np.concatenate([getattr(each, name) for each in parts]) for name in ("points", "field")
-    )
-    readings = TrainingSet(points, field, np.ones(len(points)))
-    return is_one_field(field_map, readings, np.repeat(np.arange(len(parts)), lengths))
-
-
 def is_kept_well(field_map: HarmonicMap) -> bool:
     """Return whether drives, each with what changed after it, differ by no more than chance."""
     learnt = field_map.learnt
@@ -51,7 +30,17 @@ def is_kept_well(field_map: HarmonicMap) -> bool:
 
 
 def is_one_field(field_map: HarmonicMap, readings: TrainingSet, part: IntArray) -> bool:
-    """Return the same of readings whose parts have a number each, shape (N,)."""
+    """Return whether the readings of parts differ by no more than chance makes them.
+
+    Parameters
+    ----------
+    field_map
+        Made of all of them.
+    readings
+        N of them.
+    part
+        The number of the part of each, shape (N,).
+    """
     known, noise = field_map.query(readings.points), field_map.learnt.hyperparameters.noise
     white = (readings.field - known.field) / noise
     at = np.flatnonzero(known.inside)

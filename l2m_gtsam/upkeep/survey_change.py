@@ -17,12 +17,12 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Recording
 from l2m_gtsam.errors import L2MError
-from l2m_gtsam.mapping.map_building import suite_readings
+from l2m_gtsam.mapping.map_building import survey_readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.renewal import shape_of
 from l2m_gtsam.recording.splitting import split_at
 from l2m_gtsam.upkeep.kept_map import SeenSources, read_by
-from l2m_gtsam.upkeep.survey_drives import LEAST_GAIN, SurveyDrives, halves
+from l2m_gtsam.upkeep.survey_drives import LEAST_GAIN, SurveyDrives, middle
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def parted(drives: SurveyDrives, cloud: FloatArray | None) -> SurveyDrives | Non
         Structure in the map frame in metres, shape (M, 3), if there is any.
     """
     (recording,) = drives.steady.recordings
-    both = halves(recording)
+    both = split_at(recording, middle(recording))
     mapped = [mapped_half(drives, *pair, cloud) for pair in (both, both[::-1])]
     gains = [0.0 if each is None else each.seen.gain for each in mapped]
     later = int(np.argmax(gains))
@@ -72,7 +72,7 @@ def mapped_half(
 
 def moment_of(drives: SurveyDrives, found: MappedHalf, *, before: bool) -> int:
     """Return the stamp from which on the place is another, in nanoseconds."""
-    read = suite_readings([found.other], drives.suite, drives.options.sync)
+    read = survey_readings(found.other, drives.suite, drives.options.sync)
     readings, _ = read_by(found.other, drives.suite, drives.options)
     known = found.field_map.query(read.points)
     lacking = read.field - known.field

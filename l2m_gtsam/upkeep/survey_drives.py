@@ -10,16 +10,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
 from l2m_gtsam.errors import L2MError
-from l2m_gtsam.mapping.map_building import SurveyReadings, map_of, suite_readings
+from l2m_gtsam.mapping.map_building import map_of, survey_readings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.steady_survey import SteadySurvey
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.recording.splitting import split_at
-from l2m_gtsam.upkeep.kept_map import SeenSources, drive_dates, shown_by, with_drive
+from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.upkeep.agreement import is_one_field
+from l2m_gtsam.upkeep.kept_map import SeenSources, drive_dates, read_by, shown_by, with_drive
 
 # Twice a logarithm of likelihood. At its edges a map of coarse waves misses 0.2 A m^2 of steel that
 # is not there, by 50 of it; a fork lift beside the path has 10^5.
@@ -61,11 +64,19 @@ class SurveyDrives:
         """Return a map of so many drives."""
         return map_of(self.first(count), self.suite, self.options, cloud)
 
-    def read(self) -> list[SurveyReadings]:
-        """Return what each drive read, or each half of a single one."""
-        recordings = self.steady.recordings
-        parts = recordings if len(recordings) > 1 else halves(recordings[0])
-        return [suite_readings([each], self.suite, self.options.sync) for each in parts]
+    def is_of_one_field(self, field_map: HarmonicMap) -> bool:
+        """Return whether the drives, or both halves of a single one, differ by chance alone."""
+        recordings, parts, number = self.steady.recordings, [], []
+        for k, each in enumerate(recordings):
+            readings, _ = read_by(each, self.suite, self.options)
+            late = (readings.stamp_ns >= middle(each)).astype(np.int64)
+            number.append(np.full_like(late, k) if len(recordings) > 1 else late)
+            parts.append(survey_readings(each, self.suite, self.options.sync))
+        points, field = (
+            np.concatenate([getattr(each, name) for each in parts]) for name in ("points", "field")
+        )
+        readings_of_all = TrainingSet(points, field, np.ones(len(points)))
+        return is_one_field(field_map, readings_of_all, np.concatenate(number))
 
     def unlike(self, cloud: FloatArray | None) -> "Unlike | None":
         """Return the first drive that differs from those before it, if any does."""
@@ -80,8 +91,8 @@ class SurveyDrives:
             seen = self.shown(recording, field_map)
             if max(seen.gain, seen.vehicle) > LEAST_GAIN and (seen.sources or seen.of_vehicle):
                 return Unlike(number, seen, field_map)
-            given = [recording], self.suite, self.options.sync, self.options.pose_noise
-            read = suite_readings(*given)
+            given = recording, self.suite, self.options.sync, self.options.pose_noise
+            read = survey_readings(*given)
             field_map = field_map.updated(read.points, read.field, read.suite, read.poses)
         return None
 
@@ -123,10 +134,10 @@ class SurveyDrives:
         )
 
 
-def halves(recording: Recording) -> tuple[Recording, Recording]:
-    """Return the halves of a drive by time."""
+def middle(recording: Recording) -> int:
+    """Return the time in the middle of a drive, in nanoseconds."""
     first, last = recording.trajectory.stamp_ns[[0, -1]].tolist()
-    return split_at(recording, (first + last) // 2)
+    return (int(first) + int(last)) // 2
 
 
 @dataclass(frozen=True)

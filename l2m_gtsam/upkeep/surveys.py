@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 
 from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
+from l2m_gtsam.errors import L2MError
 from l2m_gtsam.mapping.map_building import map_of
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.steady_survey import steady_survey
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.parallel.threads import one_blas_thread
-from l2m_gtsam.upkeep.agreement import is_kept_well, saw_one_field
+from l2m_gtsam.upkeep.agreement import is_kept_well
 from l2m_gtsam.upkeep.survey_change import parted
 from l2m_gtsam.upkeep.survey_drives import SurveyDrives
 
@@ -43,14 +44,25 @@ def map_surveys(
         return map_of(steady, suite, options, cloud)
     drives = SurveyDrives.of(steady, suite, options, changes)
     field_map = drives.mapped(len(recordings), cloud)
-    if not isinstance(field_map, HarmonicMap) or saw_one_field(field_map, drives.read()):
+    if not isinstance(field_map, HarmonicMap) or drives.is_of_one_field(field_map):
         return field_map
-    several = drives if len(recordings) > 1 else parted(drives, cloud)
+    try:
+        kept = with_changes(drives, cloud)
+    except L2MError:  # a part is too little by itself to tell what changed
+        kept = None
+    if kept is not None:
+        return kept
+    # Errors of sensors and poses that were found, or stated, are in the sigmas.
+    counted = field_map.learnt.poses is not None or field_map.learnt.suite is not None
+    return field_map if counted else field_map.doubted((differing(len(recordings)),))
+
+
+def with_changes(drives: SurveyDrives, cloud: FloatArray | None) -> FieldMap | None:
+    """Return a map with what changed between drives, or during a single one; None if nothing."""
+    several = drives if len(drives.steady.recordings) > 1 else parted(drives, cloud)
     first = None if several is None else several.unlike(cloud)
     if several is None or first is None:
-        # Errors of sensors and poses that were found, or stated, are in the sigmas.
-        counted = field_map.learnt.poses is not None or field_map.learnt.suite is not None
-        return field_map if counted else field_map.doubted((differing(len(recordings)),))
+        return None
     kept = several.kept_up(first, cloud)
     if isinstance(kept, HarmonicMap) and not is_kept_well(kept):
         return kept.doubted((STILL_DIFFERING,))
