@@ -26,11 +26,13 @@ SURE = 0.999
 def is_kept_well(field_map: HarmonicMap) -> bool:
     """Return whether drives, each with what changed after it, differ by no more than chance."""
     learnt = field_map.learnt
-    return learnt.history is None or is_one_field(field_map, learnt.readings, learnt.history.drive)
+    if learnt.history is None:
+        return True
+    return disagreement(field_map, learnt.readings, learnt.history.drive) < 1
 
 
-def is_one_field(field_map: HarmonicMap, readings: TrainingSet, part: IntArray) -> bool:
-    """Return whether the readings of parts differ by no more than chance makes them.
+def disagreement(field_map: HarmonicMap, readings: TrainingSet, part: IntArray) -> float:
+    """Return by how much parts differ: 1 is what chance exceeds once in a thousand surveys.
 
     Parameters
     ----------
@@ -45,7 +47,7 @@ def is_one_field(field_map: HarmonicMap, readings: TrainingSet, part: IntArray) 
     white = (readings.field - known.field) / noise
     at = np.flatnonzero(known.inside)
     squares, freedom = between_parts(readings[at], white[at], part[at])
-    return not freedom or bool(squares < quantile(SURE, freedom))
+    return squares / float(quantile(SURE, freedom)) if freedom else 0.0
 
 
 def between_parts(readings: TrainingSet, white: FloatArray, part: IntArray) -> tuple[float, int]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from l2m_gtsam.calibration.changed_places import ChangesOptions
-from l2m_gtsam.data import FloatArray, KnownSensor, Recording
+from l2m_gtsam.data import FloatArray, KnownSensor, Recording, joined_rows
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.mapping.map_building import map_of, survey_readings
 from l2m_gtsam.mapping.options import MappingOptions
@@ -21,7 +21,7 @@ from l2m_gtsam.mapping.steady_survey import SteadySurvey
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.training import TrainingSet
-from l2m_gtsam.upkeep.agreement import is_one_field
+from l2m_gtsam.upkeep.agreement import disagreement
 from l2m_gtsam.upkeep.kept_map import SeenSources, drive_dates, read_by, shown_by, with_drive
 
 # Twice a logarithm of likelihood. At its edges a map of coarse waves misses 0.2 A m^2 of steel that
@@ -52,6 +52,11 @@ class SurveyDrives:
         known = {name: KnownSensor.ideal(name) for name in names} if suite is None else suite
         return cls(replace(steady, recordings=recordings), known, options, changes)
 
+    @property
+    def stated(self) -> bool:
+        """Whether it is stated how well any sensor is known."""
+        return any(each.covariance is not None for each in self.suite.values())
+
     def instead(self, recordings: Sequence[Recording]) -> "SurveyDrives":
         """Return the same with other drives, in order of time."""
         return replace(self, steady=replace(self.steady, recordings=recordings))
@@ -64,19 +69,18 @@ class SurveyDrives:
         """Return a map of so many drives."""
         return map_of(self.first(count), self.suite, self.options, cloud)
 
-    def is_of_one_field(self, field_map: HarmonicMap) -> bool:
-        """Return whether the drives, or both halves of a single one, differ by chance alone."""
+    def disagreement(self, field_map: HarmonicMap) -> float:
+        """Return by how much the drives differ, or both halves of one; 1 is beyond chance."""
         recordings, parts, number = self.steady.recordings, [], []
         for k, each in enumerate(recordings):
             readings, _ = read_by(each, self.suite, self.options)
             late = (readings.stamp_ns >= middle(each)).astype(np.int64)
             number.append(np.full_like(late, k) if len(recordings) > 1 else late)
-            parts.append(survey_readings(each, self.suite, self.options.sync))
-        points, field = (
-            np.concatenate([getattr(each, name) for each in parts]) for name in ("points", "field")
-        )
-        readings_of_all = TrainingSet(points, field, np.ones(len(points)))
-        return is_one_field(field_map, readings_of_all, np.concatenate(number))
+            read = survey_readings(each, self.suite, self.options.sync)
+            known = read.suite.as_found_by(field_map.learnt.suite)
+            ones = np.ones(len(readings))
+            parts.append(TrainingSet(read.points, known.corrected(read.field), ones))
+        return disagreement(field_map, joined_rows(parts), np.concatenate(number))
 
     def unlike(self, cloud: FloatArray | None) -> "Unlike | None":
         """Return the first drive that differs from those before it, if any does."""
