@@ -19,7 +19,7 @@ from l2m_gtsam.qa.report.figures.map_changes import draw_changes
 from l2m_gtsam.records.map_diary import UNDATED, Happening, MapDiary, words_of
 from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.storage.map_file import load_map, save_map
-from l2m_gtsam.upkeep.kept_map import dated_changes
+from l2m_gtsam.upkeep.dated_changes import dated_changes
 from tests.support.command_line import complaint_here, ended, l2m
 from tests.support.map_files import copy_map
 from tests.worlds.yard import START, make_yard, route, survey, with_steel, world
