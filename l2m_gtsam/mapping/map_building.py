@@ -6,7 +6,7 @@ from functools import reduce
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
+from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.shifts import suite_errors, survey_poses
@@ -35,6 +35,8 @@ class SurveyReadings:
     ----------
     points, field
         Where, in metres, and what, in uT, shapes (N, 3).
+    stamp_ns
+        When, in nanoseconds, shape (N,).
     suite
         What errors of the sensors do to that.
     poses
@@ -45,6 +47,7 @@ class SurveyReadings:
 
     points: FloatArray
     field: FloatArray
+    stamp_ns: IntArray
     suite: SuiteErrors
     poses: SurveyPoses | None = None
     doubts: tuple[str, ...] = ()
@@ -54,6 +57,7 @@ class SurveyReadings:
         return SurveyReadings(
             np.concatenate([self.points, other.points]),
             np.concatenate([self.field, other.field]),
+            np.concatenate([self.stamp_ns, other.stamp_ns]),
             self.suite.followed_by(other.suite, len(self.points)),
             errors_together(self.poses, other.poses, len(self.points)),
             self.doubts + other.doubts,
@@ -223,7 +227,8 @@ def survey_readings(
     points, field = sensor_positions(readings, known), map_fields(readings, known)
     poses = survey_poses(recording.trajectory, readings, points, field, pose_noise)
     doubts = saturation_doubts(readings.sensors, synchronised.counts)
-    return SurveyReadings(points, field, suite_errors(readings, known), poses, doubts)
+    errors = suite_errors(readings, known)
+    return SurveyReadings(points, field, readings.stamp_ns, errors, poses, doubts)
 
 
 def sensor_positions(readings: Readings, known: Sequence[KnownSensor]) -> FloatArray:

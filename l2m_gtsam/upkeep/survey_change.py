@@ -21,7 +21,7 @@ from l2m_gtsam.mapping.map_building import survey_readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.renewal import shape_of
 from l2m_gtsam.recording.splitting import split_at
-from l2m_gtsam.upkeep.kept_map import SeenSources, read_by
+from l2m_gtsam.upkeep.kept_map import SeenSources
 from l2m_gtsam.upkeep.survey_drives import LEAST_GAIN, SurveyDrives, middle
 
 
@@ -73,14 +73,13 @@ def mapped_half(
 def moment_of(drives: SurveyDrives, found: MappedHalf, *, before: bool) -> int:
     """Return the stamp from which on the place is another, in nanoseconds."""
     read = survey_readings(found.other, drives.suite, drives.options.sync)
-    readings, _ = read_by(found.other, drives.suite, drives.options)
     known = found.field_map.query(read.points)
     lacking = read.field - known.field
     shapes = [shape_of(each) for each in found.seen.sources]
     field = np.sum([each.field_and_gradient(read.points)[0] for each in shapes], axis=0)
     variance = known.variance + found.field_map.learnt.hyperparameters.noise**2
     likelier = 0.5 * np.sum((lacking**2 - (lacking - field) ** 2) / variance, axis=1)
-    stamps, gains = in_order(readings.stamp_ns[known.inside], likelier[known.inside])
+    stamps, gains = in_order(read.stamp_ns[known.inside], likelier[known.inside])
     sums = np.append(0.0, np.cumsum(gains))
     number = int(np.argmax(sums) if before else np.argmin(sums))
     return int(stamps[min(number, len(stamps) - 1)])

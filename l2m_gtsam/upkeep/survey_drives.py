@@ -22,7 +22,7 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.upkeep.agreement import disagreement
-from l2m_gtsam.upkeep.kept_map import SeenSources, drive_dates, read_by, shown_by, with_drive
+from l2m_gtsam.upkeep.kept_map import SeenSources, drive_dates, shown_by, with_drive
 
 # Twice a logarithm of likelihood. At its edges a map of coarse waves misses 0.2 A m^2 of steel that
 # is not there, by 50 of it; a fork lift beside the path has 10^5.
@@ -73,12 +73,11 @@ class SurveyDrives:
         """Return by how much the drives differ, or both halves of one; 1 is beyond chance."""
         recordings, parts, number = self.steady.recordings, [], []
         for k, each in enumerate(recordings):
-            readings, _ = read_by(each, self.suite, self.options)
-            late = (readings.stamp_ns >= middle(each)).astype(np.int64)
-            number.append(np.full_like(late, k) if len(recordings) > 1 else late)
             read = survey_readings(each, self.suite, self.options.sync)
+            late = (read.stamp_ns >= middle(each)).astype(np.int64)
+            number.append(np.full_like(late, k) if len(recordings) > 1 else late)
             known = read.suite.as_found_by(field_map.learnt.suite)
-            ones = np.ones(len(readings))
+            ones = np.ones(len(read.points))
             parts.append(TrainingSet(read.points, known.corrected(read.field), ones))
         return disagreement(field_map, joined_rows(parts), np.concatenate(number))
 
