@@ -309,6 +309,8 @@ class Readings:
         (N, K); zero where they do not act on a sensor, absent where none were recorded.
     drive
         Which drive each is of, ascending for each sensor, shape (N,); absent where there is one.
+    relative_noise
+        How large the noise of each is beside its sensor's, shape (N,); absent where it is one.
     """
 
     sensors: tuple[str, ...]
@@ -321,6 +323,7 @@ class Readings:
     pose_root: FloatArray | None = None
     regressors: FloatArray | None = None
     drive: IntArray | None = None
+    relative_noise: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.sensor)
@@ -332,6 +335,15 @@ class Readings:
     def of_drive(self) -> IntArray:
         """Which drive each is of, shape (N,); 0 where there is one."""
         return np.zeros(len(self), dtype=np.int64) if self.drive is None else self.drive
+
+    @property
+    def noise_ratio(self) -> FloatArray:
+        """How large the noise of each is beside its sensor's, shape (N,)."""
+        return np.ones(len(self)) if self.relative_noise is None else self.relative_noise
+
+    def noise(self, of_sensors: FloatArray) -> FloatArray:
+        """Return the noise of each in uT, shape (N,), by that of the S sensors, shape (S,)."""
+        return np.asarray(of_sensors[self.sensor] * self.noise_ratio)
 
     def select(self, keep: BoolArray) -> "Readings":
         """Return the readings where ``keep``, shape (N,), is true."""

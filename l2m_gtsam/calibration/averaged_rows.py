@@ -126,7 +126,7 @@ def slot_whitening(
     readings, estimate = drive.view.readings, drive.estimate
     R, N = readings.R_map_lidar, len(readings)
     spread = right_divided(R, estimate.C()[readings.sensor])
-    spread = drive.averages.noise[readings.sensor][:, None, None] * spread
+    spread = readings.noise(drive.averages.noise)[:, None, None] * spread
     own = spread @ spread.transpose(0, 2, 1) + rest[:, :, None] * np.eye(3)
     by_pose = pose_shares(readings, field_map, estimate, options)
     order = np.argsort(drive.averages.slot, kind="stable")

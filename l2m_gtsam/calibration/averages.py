@@ -83,7 +83,7 @@ def averaged(
     """
     lacking = lacking_field(readings, field_map, estimate)
     moved = np.linalg.norm(np.diff(places_of(readings, estimate.t), axis=0), axis=1)
-    noise = estimate.noise[readings.sensor]
+    noise = readings.noise(estimate.noise)
     kept = ~spikes(readings.sensor, moved, lacking, noise, nearest)
     readings, used, lacking = readings.select(kept), used[kept], lacking[kept]
     slot = slots_of(readings, estimate, options.step_m)
@@ -112,6 +112,7 @@ def scatter(readings: Readings, deviation: FloatArray, count: IntArray) -> Float
     """
     noise = np.zeros(len(readings.sensors))
     squared = np.sum(deviation**2, axis=1) * count / np.maximum(count - 1, 1)
+    squared /= readings.noise_ratio**2
     for sensor in np.unique(readings.sensor).tolist():
         own = (readings.sensor == sensor) & (count >= FEWEST)
         if own.any():

@@ -166,7 +166,10 @@ def _result(
         raise CalibrationError(_nothing_solved(recording, map_source, sensors, covered))
     stretches = _rejected_stretches(solution, changed.solver_map, options)
     return CalibrationResult(
-        sensors=tuple(_with_missing(each, readings, recording) for each in sensors),
+        sensors=tuple(
+            _with_noise(_with_missing(each, readings, recording), solution.readings, recording)
+            for each in sensors
+        ),
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
         doubts=(
@@ -307,6 +310,18 @@ def _with_missing(
         drive.source.path for k, drive in enumerate(recording.drives) if not np.any(own == k)
     ]
     return replace(sensor, missing_in=tuple(missing)) if missing else sensor
+
+
+def _with_noise(
+    sensor: SensorCalibration, readings: Readings, recording: Recording
+) -> SensorCalibration:
+    """Return the same with its noise on each drive, where that differs."""
+    own = readings.alone(readings.sensors.index(sensor.sensor))
+    if (own.noise_ratio == 1).all():
+        return sensor
+    sizes = np.full(len(recording.drives), sensor.noise)
+    sizes[own.of_drive] = sensor.noise * own.noise_ratio
+    return replace(sensor, drive_noise=tuple(sizes.tolist()))
 
 
 def _in_own_time(stretch: Disagreement, recording: Recording) -> Disagreement:

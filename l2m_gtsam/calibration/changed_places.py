@@ -96,9 +96,8 @@ def suspected(
     _, cell = np.unique(np.floor(places[:, :2] / CELL_M), axis=0, return_inverse=True)
     count = np.bincount(cell)
     shares = pose_shares(readings, field_map, estimate, options)
-    own = (
-        np.einsum("nij,nij->ni", shares, shares) + drive.averages.noise[readings.sensor, None] ** 2
-    )
+    noise = readings.noise(drive.averages.noise)
+    own = np.einsum("nij,nij->ni", shares, shares) + noise[:, None] ** 2
 
     def mean(values: FloatArray) -> FloatArray:
         return np.stack([np.bincount(cell, each) for each in values.T], axis=1) / count[:, None]

@@ -130,8 +130,8 @@ def group_noise(
     """
     readings, C = view.readings, estimate.C()[view.readings.sensor]
     share = map_covariance(C, readings.R_map_lidar, coverage.rest)
-    own = reading_covariance(estimate.noise[readings.sensor], share, view.trust)
-    sensor = np.square(estimate.noise[readings.sensor])
+    noise = readings.noise(estimate.noise)
+    own, sensor = reading_covariance(noise, share, view.trust), np.square(noise)
     R_lidar_map = readings.R_map_lidar.transpose(0, 2, 1)
     q = readings.regressors
     of_suite = suite_share(readings, field_map, coverage, estimate)

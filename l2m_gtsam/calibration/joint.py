@@ -215,7 +215,7 @@ def joint_problem(
     features = error_of_poses(view.readings, field_map, estimate)
     by_pose = C @ features
     share += by_pose @ by_pose.transpose(0, 2, 1)
-    covariance = reading_covariance(estimate.noise[sensor], share, view.trust)
+    covariance = reading_covariance(view.readings.noise(estimate.noise), share, view.trust)
     values, W, readings = estimate.values(view.sensors), whitening(covariance), view.readings
     noise = estimate.noise[view.sensors]
     if readings.pose_root is not None and not take_all_noise(noise):
@@ -257,11 +257,12 @@ def joint_step(
 def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
     """Return the most likely noise of each sensor in uT, shape (S,)."""
     noise, values = estimate.noise.copy(), estimate.values(problem.view.sensors)
-    variance = np.trace(problem.share, axis1=1, axis2=2) / 3
+    ratio = problem.view.readings.noise_ratio
+    variance = np.trace(problem.share, axis1=1, axis2=2) / (3 * ratio**2)
     for s in problem.view.sensors:
         rows, taken = problem.batch.rows_of(s), problem.determinacies[s].free
         rows = rows[problem.view.trust[rows] > HALF]
-        residual = problem.batch.residuals(values, s).residual[rows]
+        residual = problem.batch.residuals(values, s).residual[rows] / ratio[rows, None]
         noise[s] = estimate_noise(residual, variance[rows], 1 - taken / residual.size)
     return noise
 

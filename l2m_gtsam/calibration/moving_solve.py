@@ -60,8 +60,7 @@ def model_samples(
     names
         Of the readings' recorded numbers.
     """
-    sensor = int(readings.sensor[0])
-    t, noise = estimate.t[sensor], estimate.noise[sensor]
+    t = estimate.t[int(readings.sensor[0])]
     inside = sample.inside
     readings, R_lidar_map = readings.select(inside), readings.R_map_lidar[inside].transpose(0, 2, 1)
     b = np.einsum("nij,nj->ni", R_lidar_map, sample.field[inside])
@@ -72,7 +71,7 @@ def model_samples(
         b=b,
         db_dt=_rates(readings, b, slope, t),
         q=q,
-        weights=1 / (noise**2 + sample.variance[inside].mean(axis=1)),
+        weights=1 / (readings.noise(estimate.noise) ** 2 + sample.variance[inside].mean(axis=1)),
         names=names,
         drive=readings.drive,
     )

@@ -178,7 +178,7 @@ def shared_errors(view: View, field_map: QueryableMap, near: Estimate) -> Shared
     s = readings.sensor
     e = readings.field - near.distortion[s, 9:] - np.einsum("nij,nj->ni", near.C()[s], view.b_lidar)
     F = near.C()[s] @ error_of_poses(readings, field_map, near)
-    weight = view.trust / np.square(near.noise[s])
+    weight = view.trust / np.square(readings.noise(near.noise))
     a = np.einsum("n,nij,ni->nj", weight, F, e)
     G = np.einsum("n,nij,nik->njk", weight, F, F).reshape(-1, 36)
     of_map = np.sqrt(view.map_variance.mean(axis=1))

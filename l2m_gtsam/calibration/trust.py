@@ -122,11 +122,12 @@ def trusted(
         return counting(view, last.weights, options.min_readings, final=True)
     stage = GRADUATION[min(round_, len(GRADUATION) - 1)]
     weights = np.empty(len(view.readings))
-    e = residuals(view.readings, field_map, estimate)
+    e, ratio = residuals(view.readings, field_map, estimate), view.readings.noise_ratio
     for sensor in view.sensors:
         rows = view.readings.rows_of(sensor)
         # The estimate's noise counts wrong readings in; but no more than half can be wrong.
-        noise = median_noise(e[rows], view.map_variance[rows].mean(axis=1))
+        variance = view.map_variance[rows].mean(axis=1) / ratio[rows] ** 2
+        noise = median_noise(e[rows] / ratio[rows, None], variance)
         if options.sensor_noise_ut is not None:
             noise = max(noise, options.sensor_noise_ut)
         weights[rows] = weigh(view, rows, e[rows], estimate, noise, options.robust, stage)
@@ -162,15 +163,17 @@ def weigh(
         Stage of the graduation.
     """
     sensor, variance = int(view.readings.sensor[rows.start]), view.map_variance[rows]
+    ratio = view.readings.noise_ratio[rows]
     C = np.broadcast_to(estimate.C()[sensor], (len(residual), 3, 3))
     share = map_covariance(C, view.readings.R_map_lidar[rows], variance)
-    W = whitening(reading_covariance(np.full(len(residual), noise), share))
+    W = whitening(reading_covariance(noise * ratio, share))
     white = np.einsum("nij,nj->ni", W, residual)
     r2 = np.einsum("ni,ni->n", white, white)
     weights = WEIGHTS[options.loss](r2, options.largest, mu)
     if options.loss is Loss.TRUNCATED and np.isinf(mu):
         rejected = weights < NOTHING
-        weights[grown(rejected, residual, noise, variance.mean(axis=1))] = 0.0
+        same = residual / ratio[:, None], noise, variance.mean(axis=1) / ratio**2
+        weights[grown(rejected, *same)] = 0.0
     return weights
 
 

@@ -69,11 +69,12 @@ class UncertainOptimum:
 
     def noise(self) -> FloatArray:
         """Return the most likely noise of each sensor in uT, shape (S,)."""
-        noise, rest = self.problem.estimate.noise.copy(), self.problem.noise.rest
+        noise, ratio = self.problem.estimate.noise.copy(), self._view.readings.noise_ratio
+        residual, rest = self._residual / ratio[:, None], self.problem.noise.rest / ratio**2
         for s in self._view.sensors:
             rows = self.problem.batch.rows_of(s)
             rows = rows[self._view.trust[rows] > HALF]
-            noise[s] = estimate_noise(self._residual[rows], rest[rows], self._left[rows])
+            noise[s] = estimate_noise(residual[rows], rest[rows], self._left[rows])
         return noise
 
     def solutions(self) -> tuple[SensorSolution, ...]:

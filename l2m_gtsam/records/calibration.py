@@ -237,6 +237,8 @@ class SensorCalibration:
         sensor to which no model with them is recommended.
     missing_in
         Paths of those of several drives in which nothing usable was read.
+    drive_noise
+        Noise on each of several drives in uT, in the order of `bags`; empty where they are alike.
     unmodelled
         How far the covariance exceeds what noise, map and poses explain.
     variance_shares
@@ -268,6 +270,7 @@ class SensorCalibration:
     not_compared: str = ""
     moving: Annotated[tuple[MovingField, ...], KeyedBy("name")] = ()
     missing_in: tuple[str, ...] = ()
+    drive_noise: tuple[float, ...] = ()
     unmodelled: Unmodelled = EXPLAINED
     variance_shares: tuple[VarianceShare, ...] = ()
     common: Annotated[FloatArray, InFile(Rows16, np.atleast_2d)] | None = None

@@ -153,7 +153,7 @@ SENSOR_KEYS = (
     *("status", "message", "t_lidar_mag", "t_sigma", "C", "C_sigma", "H", "H_sigma"),
     *("R_lidar_mag", "rotation_sigma", "rotation_covariance", "transforms", "noise"),
     *("undetermined", "from_priors", "residuals", "readings", "outside_map", "rejected", "start"),
-    *("time_offset", "moving", "models", "not_compared", "missing_in"),
+    *("time_offset", "moving", "models", "not_compared", "missing_in", "drive_noise"),
     *("unmodelled", "variance_shares", "common", "covariance"),
 )
 """In the order of the file; the matrix of 15 rows comes last, since it hides what follows it."""
@@ -296,7 +296,7 @@ def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
     for name in ("saturated", "limits"):
         values["readings"] = _without_empty(values["readings"], name)
     entry = {key: values[key] for key in SENSOR_KEYS}
-    for name in ("missing_in", "unmodelled", "variance_shares", "common"):
+    for name in ("missing_in", "drive_noise", "unmodelled", "variance_shares", "common"):
         entry = _without_empty(entry, name)
     return entry
 

@@ -85,7 +85,7 @@ def sensor_evidence(
     residual = sensor.distortion.apply(b) - readings.field
     map_share = map_covariance(np.broadcast_to(C, R.shape), R, sample.variance)
     poses = _pose_share(readings, sensor, sample, b)
-    W = whitening(reading_covariance(np.full(len(b), sensor.noise), map_share + poses))
+    W = whitening(reading_covariance(sensor.noise * readings.noise_ratio, map_share + poses))
     return SensorEvidence(
         readings=readings,
         used=~drive.rejected[own],

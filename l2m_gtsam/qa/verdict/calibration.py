@@ -123,6 +123,11 @@ def _exact(result: CalibrationResult) -> list[Reason]:
     if (lasting := result.pose_duration) and lasting.source is DurationSource.FOUND:
         text = f"Errors of poses last {significant(lasting.seconds, 2)} s, by the readings."
         reasons.append(Reason(Level.PASS, text))
+    if found := [each.drive_noise for each in result.sensors if each.drive_noise]:
+        sizes = zip(result.bags, np.median(found, axis=0).tolist(), strict=True)
+        each = ", ".join(f"{significant(size, 2)} µT in {bag.path}" for bag, size in sizes)
+        text = f"Noise differs between drives: {each}. Each reading counts with that of its own."
+        reasons.append(Reason(Level.PASS, text))
     if size := result.unseen_warp_m:
         text = (
             f"The drive's frame may be bent against the map's by {1e3 * size:.1f} mm: the readings "
