@@ -389,7 +389,8 @@ class SaturatedAxis:
 class SyncCounts:
     """How many readings of one sensor were kept and why the others were not.
 
-    ``limits`` are those of its range that the ``saturated`` readings exceed.
+    ``limits`` are those of its range that the ``saturated`` readings exceed. Those ``elsewhere``
+    are in parts of a large map that do not count.
     """
 
     received: int
@@ -400,6 +401,7 @@ class SyncCounts:
     thinned: int
     kept: int
     without_regressor: int = 0
+    elsewhere: int = 0
     saturated: int = 0
     limits: tuple[SaturatedAxis, ...] = ()
 

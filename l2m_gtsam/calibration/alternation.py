@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from l2m_factors import T
+from l2m_gtsam.calibration.extent import MOST_WEIGHTS
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, reading_graph
 from l2m_gtsam.calibration.optimise import Optimizer, optimise
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
@@ -77,6 +78,9 @@ class OneKeyOptions(Options):
     """How far the drive's frame may be bent against the map's, beforehand: standard deviation of
     shifts along the floor in metres. What readings leave possible of it is in the sigmas; 0 where
     both frames are one, as by motion capture."""
+    most_weights: int = Field(default=MOST_WEIGHTS, ge=20)
+    """Of how many numbers a map's errors may be. Where a drive has more, its tiles with the most
+    readings count. Time grows with the cube of this, memory with its square."""
     robust: RobustOptions = RobustOptions()
     """What becomes of readings that the map and one distortion cannot explain."""
     moving_field_ut: float = Field(default=50.0, gt=0)

@@ -9,6 +9,7 @@ from l2m_gtsam.calibration.budget.found import Budget
 from l2m_gtsam.calibration.changed_places import ChangedSolve, solve_changed
 from l2m_gtsam.calibration.coverage import KnowsSurvey
 from l2m_gtsam.calibration.explanation import explained
+from l2m_gtsam.calibration.extent import Extent, extent_of
 from l2m_gtsam.calibration.jumping_solve import solve_jumping
 from l2m_gtsam.calibration.moving_solve import MovingProblem
 from l2m_gtsam.calibration.one_key import OneKeySolution
@@ -119,6 +120,9 @@ def calibrated(
     priors = priors_of(options.priors, alive.sensors)
     found = _starts(alive, compiled, options, priors, progress)
     t_start = _start_places(alive.sensors, found, options)
+    extent = extent_of(alive, solver_map, t_start, options.solve.most_weights)
+    synchronised = _within(synchronised, alive, extent)
+    alive = alive.select(extent.counts)
     problem = MovingProblem(
         readings=alive,
         names=tuple(each.name for each in recording.scalars),
@@ -146,7 +150,9 @@ def calibrated(
     )
     result = _result(recording, drive, changed, solved_map, options, map_source)
     jumps = tuple(_jump_in_own_time(each, recording) for each in jumping.jumps)
-    result = replace(result, jumps=jumps)
+    taken = f"{extent.note} (`calibration.solve.most_weights`)"
+    notes = (*result.notes, taken) if extent.left_out else result.notes
+    result = replace(result, jumps=jumps, notes=notes)
     return Calibrated(result, outcome.solution, solved_map, solver_map)
 
 
@@ -225,6 +231,14 @@ def _prepared(recording: Recording, options: CalibrationOptions) -> Synchronised
         pose_root=pose_roots(poses, readings.stamp_ns, options.solve.pose_noise),
     )
     return replace(synchronised, readings=readings)
+
+
+def _within(synchronised: Synchronised, alive: Readings, extent: Extent) -> Synchronised:
+    """Return the account of the readings without those that are beyond the extent."""
+    beyond = np.bincount(alive.sensor[~extent.counts], minlength=len(alive.sensors)).tolist()
+    pairs = zip(synchronised.counts, beyond, strict=True)
+    counts = (replace(each, kept=each.kept - n, elsewhere=n) for each, n in pairs)
+    return replace(synchronised, counts=tuple(counts))
 
 
 def _rejected_stretches(

@@ -45,6 +45,8 @@ class MapSummary:
 # What some maps have and others have not, by which protocols know them.
 OPTIONAL = (
     "errors_over",
+    "tile_of",
+    "weights_in",
     "sensors_uncertain",
     "poses_uncertain",
     "errors_over_stated",

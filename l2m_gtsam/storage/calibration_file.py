@@ -293,7 +293,7 @@ def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
     }
     if sensor.unmodelled == EXPLAINED:
         values["unmodelled"] = None
-    for name in ("saturated", "limits"):
+    for name in ("saturated", "limits", "elsewhere"):
         values["readings"] = _without_empty(values["readings"], name)
     entry = {key: values[key] for key in SENSOR_KEYS}
     for name in ("missing_in", "drive_noise", "unmodelled", "variance_shares", "common"):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from l2m_gtsam.calibration.calibrate import prepare
+from l2m_gtsam.calibration.extent import Extent, extent_of
 from l2m_gtsam.calibration.offset_courses import ANYTHING_UT, Course, without_course
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
@@ -22,6 +23,9 @@ from l2m_gtsam.validation.displacement import SensorsOnDrive
 from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
 from l2m_gtsam.validation.innovation import KnownCalibration
 from l2m_gtsam.validation.recheck import SensorDrive, finite, recheck
+
+# Of a map's errors: a test solves several graphs for each sensor.
+MOST_WEIGHTS = 2500
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class DriveTest:
         As of `validate`.
     thinning
         How much of the drive is kept.
+    extent
+        Which of its readings count, where the drive crosses much of the map.
     courses
         Jumps and drifts of H that are taken off the readings.
     reads_as
@@ -56,6 +62,7 @@ class DriveTest:
     options: CalibrationOptions
     chance: float
     thinning: Thinning
+    extent: Extent
     courses: tuple[Course, ...] = ()
     reads_as: Mapping[str, str] = field(default_factory=dict)
 
@@ -101,6 +108,10 @@ def drive_test(
     kept = tuple(each for each in recording.series if each.sensor in shared)
     synchronised = prepare(replace(recording, series=kept), options)
     readings = synchronised.readings
+    places = {each.sensor: each.t_lidar_mag for each in known}
+    t = np.array([places[name] for name in readings.sensors])
+    extent = extent_of(readings, for_solvers(field_map), t, MOST_WEIGHTS)
+    readings = readings.select(extent.counts)
     pairs = zip(readings.sensors, synchronised.counts, strict=True)
     return DriveTest(
         recording=recording,
@@ -113,6 +124,7 @@ def drive_test(
         thinning=Thinning(
             readings.stamp_ns.min(keepdims=True), int(np.clip(DRAWN // len(known), FEWEST, MOST))
         ),
+        extent=extent,
     )
 
 

@@ -108,6 +108,8 @@ def validate(
     drive, judged = _beside_steel(drive)
     progress("validating", 1.0)
     doubts, notes = doubts_and_notes(field_map, calibration, map_source)
+    if test.extent.left_out:
+        notes = (*notes, f"{test.extent.note[:1].upper()}{test.extent.note[1:]}.")
     if judged is not None:
         doubts = (judged.sentence, *doubts)
     elif is_searched(drive.test.field_map, options.changes) and drive.changed:

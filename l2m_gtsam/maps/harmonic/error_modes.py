@@ -149,14 +149,18 @@ def error_modes(
     crossed = np.unique(owner).tolist()
 
     def modes(index: int) -> TileModes:
-        rows = np.flatnonzero(owner == index)
-        some = rows[np.linspace(0, len(rows) - 1, min(options.places, len(rows))).astype(int)]
-        directions = leading(tiles[index].root_rows(points[some]), options.rest)
-        return TileModes(tiles[index], tiles[index].unwhitened(directions))
+        return tile_modes(tiles[index], points[owner == index], options)
 
     found = dict(zip(crossed, in_threads(modes, crossed), strict=True))
     suite = suite_modes(learnt, found, points, owner, options)
     return ErrorModes(learnt.tiling.grid, found, joint_covariance(learnt, found), suite)
+
+
+def tile_modes(tile: Tile, points: FloatArray, options: ErrorOptions) -> TileModes:
+    """Return the error of a tile over places in it, shape (N, 3)."""
+    some = np.linspace(0, len(points) - 1, min(options.places, len(points))).astype(int)
+    directions = leading(tile.root_rows(points[some]), options.rest)
+    return TileModes(tile, tile.unwhitened(directions))
 
 
 def suite_modes(

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
-from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
+from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes, tile_modes
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.pose_sizes import with_pose_errors
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
@@ -160,6 +160,14 @@ class HarmonicMap:
     def errors_over(self, points: FloatArray, /) -> ErrorModes:
         """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
         return error_modes(self.learnt, self.tiles, checked_points(points), self.options.errors)
+
+    def tile_of(self, points: FloatArray, /) -> IntArray:
+        """Return which tile answers at each place, shape (N,)."""
+        return self.learnt.tiling.grid.block_of(points)
+
+    def weights_in(self, tile: int, points: FloatArray, /) -> int:
+        """Return of how many numbers the errors are at places in a tile."""
+        return len(tile_modes(self.tiles[tile], points, self.options.errors))
 
     def updated(
         self,

@@ -92,6 +92,7 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
     """Return what speaks against map, place and drive."""
     reasons = [Reason(Level.WARN, f"Of the map: {doubt}.") for doubt in result.doubts]
     reasons += source_reasons(result.sources)
+    reasons += _of_its_survey(result)
     reasons += _old_map(result, cases[0].options) if cases else []
     shared = [each for each in result.disagreements if _is_shared(each, result)]
     reasons += [Reason(Level.WARN, _changed(each, result)) for each in shared[:MANY]]
@@ -103,6 +104,19 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
     reasons += stated_wrongly(result.stated, None, result.pose_duration)
     elsewhere = _wrong_map(cases) or _bent_too_far(cases, result)
     return elsewhere or [*_on_drive(cases), *reasons, *_exact(result)]
+
+
+def _of_its_survey(result: CalibrationResult) -> list[Reason]:
+    """Return that the map was made from drives on which sensors are calibrated."""
+    sources = () if result.map_origin is None else result.map_origin.sources
+    surveyed = {each.sha256 for each in sources}
+    if not (own := [each.path for each in result.drives if each.sha256 in surveyed]):
+        return []
+    text = (
+        f"The map was made from {', '.join(own)}: noise is in both, and sensors that surveyed come "
+        "out as they were assumed, right or wrong; calibrate on another drive."
+    )
+    return [Reason(Level.WARN, text)]
 
 
 def _old_map(result: CalibrationResult, options: QaOptions) -> list[Reason]:

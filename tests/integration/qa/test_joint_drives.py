@@ -18,7 +18,9 @@ from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import SensorStatus
+from l2m_gtsam.records.map_diary import UNDATED
 from l2m_gtsam.records.metrics import Metrics
+from l2m_gtsam.records.provenance import MapOrigin, NamedSource
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.record_files import read_metrics, write_metrics
@@ -391,3 +393,18 @@ def test_drives_alike_have_one_noise(good: Made, tmp_path: Path) -> None:
     write_calibration(tmp_path / "a.yaml", good.calibrated.result)
     assert "drive_noise" not in (tmp_path / "a.yaml").read_text()
     assert all("Noise differs" not in each.text for each in good.verdict.reasons)
+
+
+def test_a_map_that_was_made_from_one_of_the_drives_is_named(good: Made) -> None:
+    """Its noise is in both, and a sensor that surveyed comes out as it was assumed."""
+    monday_, tuesday_ = good.calibrated.result.bags
+    suite = NamedSource("suite", "suite.yaml", "of a suite")
+    for source, level in ((tuesday_, Level.WARN), (suite, Level.PASS)):
+        bag = NamedSource("bag", source.path, source.sha256)
+        origin = MapOrigin(UNDATED, sources=(bag,))
+        result = replace(good.calibrated.result, map_origin=origin)
+        verdict = judge(result, good.metrics, QaOptions())
+        assert verdict.level is level
+        named = [each.text for each in verdict.reasons if "The map was made from" in each.text]
+        assert [tuesday_.path in each for each in named] == [True] * (level is Level.WARN)
+        assert not any(monday_.path in each for each in named)
