@@ -9,7 +9,7 @@ from l2m_gtsam.calibration.budget.found import Budget
 from l2m_gtsam.calibration.changed_places import ChangedSolve, solve_changed
 from l2m_gtsam.calibration.coverage import KnowsSurvey
 from l2m_gtsam.calibration.explanation import explained
-from l2m_gtsam.calibration.extent import Extent, extent_of
+from l2m_gtsam.calibration.extent import extent_of
 from l2m_gtsam.calibration.jumping_solve import solve_jumping
 from l2m_gtsam.calibration.moving_solve import MovingProblem
 from l2m_gtsam.calibration.one_key import OneKeySolution
@@ -121,8 +121,7 @@ def calibrated(
     found = _starts(alive, compiled, options, priors, progress)
     t_start = _start_places(alive.sensors, found, options)
     extent = extent_of(alive, solver_map, t_start, options.solve.most_weights)
-    synchronised = _within(synchronised, alive, extent)
-    alive = alive.select(extent.counts)
+    synchronised, alive = extent.accounted(synchronised, alive), alive.select(extent.counts)
     problem = MovingProblem(
         readings=alive,
         names=tuple(each.name for each in recording.scalars),
@@ -231,14 +230,6 @@ def _prepared(recording: Recording, options: CalibrationOptions) -> Synchronised
         pose_root=pose_roots(poses, readings.stamp_ns, options.solve.pose_noise),
     )
     return replace(synchronised, readings=readings)
-
-
-def _within(synchronised: Synchronised, alive: Readings, extent: Extent) -> Synchronised:
-    """Return the account of the readings without those that are beyond the extent."""
-    beyond = np.bincount(alive.sensor[~extent.counts], minlength=len(alive.sensors)).tolist()
-    pairs = zip(synchronised.counts, beyond, strict=True)
-    counts = (replace(each, kept=each.kept - n, elsewhere=n) for each, n in pairs)
-    return replace(synchronised, counts=tuple(counts))
 
 
 def _rejected_stretches(

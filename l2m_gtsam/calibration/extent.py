@@ -7,13 +7,13 @@ drive the tiles with the most readings count. What is left out is missing in the
 the sigmas.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from l2m_gtsam.calibration.view import places_of
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings, Synchronised
 from l2m_gtsam.parallel.threads import in_threads
 
 MOST_WEIGHTS = 6000  # minutes, and five gigabytes
@@ -52,6 +52,14 @@ class Extent:
     def left_out(self) -> int:
         """How many readings do not count."""
         return int(np.sum(~self.counts))
+
+    def accounted(self, synchronised: Synchronised, readings: Readings) -> Synchronised:
+        """Return the account of a drive without those of the N readings that do not count."""
+        sensor = readings.sensor[~self.counts]
+        beyond = np.bincount(sensor, minlength=len(readings.sensors)).tolist()
+        pairs = zip(synchronised.counts, beyond, strict=True)
+        counts = (replace(each, kept=each.kept - n, elsewhere=n) for each, n in pairs)
+        return replace(synchronised, counts=tuple(counts))
 
     @property
     def note(self) -> str:

@@ -121,6 +121,7 @@ def plan(
     print_table(motion_table(found), wide)
     say(advice(found))
     say(UNCERTAINTY[found.uncertainty])
+    say(*found.notes)
     warn(found.doubts)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.calibrate import covers, not_covered, prepare
 from l2m_gtsam.calibration.explanation import from_priors, undetermined
+from l2m_gtsam.calibration.extent import extent_of
 from l2m_gtsam.calibration.forecast import Forecast, forecast
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.options import CalibrationOptions
@@ -44,6 +45,7 @@ from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
 NANOSECONDS = 1e9
 BREAK_NS = 60_000_000_000  # between a drive and a motion that is added to it
 UNKNOWN = np.diag(np.full(len(PARAMETERS), np.inf))
+OF_A_MOTION = 2500  # numbers of the map's errors: there are several motions to compare
 NOISE_FACT = "noise of a reading (uT)"  # of the summary of maps that learn it
 
 
@@ -126,7 +128,12 @@ def plan(
     solver_map = for_solvers(field_map)
     noise = _noise(field_map, options, planning)
     priors = priors_of(options.priors, readings.sensors)
-    task = Task(solver_map, _places(readings.sensors, options, priors), noise, options, priors)
+    t = _places(readings.sensors, options, priors)
+    extent = extent_of(readings, solver_map, t, options.solve.most_weights)
+    counted = readings.select(extent.counts)
+    synchronised = replace(extent.accounted(synchronised, readings), readings=counted)
+    readings = counted
+    task = Task(solver_map, t, noise, options, priors)
     with reported("what the drive determines", progress):
         found = task.forecast(readings)
     if not found.view.inside.any():
@@ -137,6 +144,7 @@ def plan(
     least = max(read, key=lambda index: worsts[index].badness)
     # The other sensors are known better: what a motion does for them need not be asked.
     one, alone = task.of(least), readings.alone(least)
+    alone = alone.select(extent_of(alone, solver_map, one.t, OF_A_MOTION).counts)
     motions = _with_motions(one, alone, _motions(alone, solver_map, planning), progress)
     return DrivePlan(
         sensors=sensors,
@@ -145,6 +153,7 @@ def plan(
         worst=one.worst(alone),
         motions=motions,
         doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
+        notes=(extent.note,) if extent.left_out else (),
     )
 
 

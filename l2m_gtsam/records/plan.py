@@ -113,6 +113,8 @@ class DrivePlan(BySensor[SensorPlan]):
         The same with an extra motion, the most helpful first.
     doubts
         What speaks against the map, and therefore against the sigmas, a sentence each.
+    notes
+        What else is worth knowing, likewise.
     """
 
     sensors: tuple[SensorPlan, ...]
@@ -121,3 +123,4 @@ class DrivePlan(BySensor[SensorPlan]):
     worst: Worst
     motions: tuple[MotionPlan, ...]
     doubts: tuple[str, ...]
+    notes: tuple[str, ...] = ()

@@ -8,13 +8,14 @@ import pytest
 
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.data import Recording, SourceFile
+from l2m_gtsam.planning.plan import PlanOptions, plan
 from l2m_gtsam.recording.splitting import split_at
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.validation import drive_test
 from l2m_gtsam.validation.validate import validate
 from tests.drives.moving import MovingDrive, moving_drive, options
-from tests.drives.uncertain import surveyed
+from tests.drives.uncertain import NOISE, surveyed
 
 LIMIT = 50  # numbers of the map's errors; the drive has twice as many
 
@@ -75,3 +76,17 @@ def test_a_calibration_is_tested_on_a_part(
     assert any("tiles of the map" in each for each in found.notes)
     for each in found.sensors:
         assert not each.changes
+
+
+def test_a_plan_foretells_the_part_that_will_count(made: MovingDrive) -> None:
+    """With C = I: distortions of a tenth, and readings that are rejected, change sigmas by less."""
+    chosen = options(made)
+    solve = chosen.solve.model_copy(update={"most_weights": LIMIT, "sensor_noise_ut": NOISE})
+    chosen = chosen.model_copy(update={"solve": solve})
+    found = plan(made.silent, surveyed(1), chosen, PlanOptions())
+    assert any("tiles of the map" in each for each in found.notes)
+    result = calibrate(made.silent, surveyed(1), chosen)
+    for each in found.sensors:
+        one = result[each.sensor]
+        assert each.readings == one.used + one.rejected
+        np.testing.assert_allclose(each.sigma[:3], one.t_sigma, rtol=0.3)
