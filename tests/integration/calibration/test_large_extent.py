@@ -8,7 +8,8 @@ import pytest
 
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.data import Recording, SourceFile
-from l2m_gtsam.planning.plan import PlanOptions, plan
+from l2m_gtsam.planning.motion import PlanOptions
+from l2m_gtsam.planning.plan import plan
 from l2m_gtsam.recording.splitting import split_at
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
