@@ -1,31 +1,14 @@
-"""What the map predicts at the readings, at an estimate of poses and sensors, and its errors.
-
-The map's errors are variables ``M(b)``, shared by readings near each other. Counted as independent
-noise of each reading they would average out, which they do not: a parked vehicle would seem to
-learn its place ever better.
-"""
+"""What the map predicts at the readings, at an estimate of poses and sensors."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
 
-from l2m_factors import (
-    D,
-    KeyPoseReadings,
-    M,
-    MagneticReadings,
-    SharedError,
-    T,
-    X,
-    map_weights_prior,
-    skew,
-)
-from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
+from l2m_factors import D, KeyPoseReadings, MagneticReadings, T, X, skew
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.slam.drive import KnownSensors, stacked
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 
@@ -184,76 +167,3 @@ def sensors_in(values: gtsam.Values, known: KnownSensors) -> KnownSensors:
         known.noise,
         known.covariance,
     )
-
-
-@dataclass(frozen=True)
-class SharedMapErrors:
-    """The map's errors at N readings.
-
-    Attributes
-    ----------
-    owner
-        Tile of each reading, shape (N,); -1 outside of the map.
-    features
-        Of each tile F of its readings in their order, in the lidar frame in uT, shape (n, 3, r).
-    rest
-        Variance that stays independent per axis of the map in uT^2, shape (N, 3).
-    sizes
-        Number of weights of each tile.
-    root_information
-        Of all weights, shape (K, K).
-    """
-
-    owner: IntArray
-    features: dict[int, FloatArray]
-    rest: FloatArray
-    sizes: dict[int, int]
-    root_information: FloatArray
-
-    @classmethod
-    def over(cls, errors: UncertainMap, prediction: MapPrediction) -> "SharedMapErrors":
-        """Return a map's errors at readings."""
-        rows = np.flatnonzero(prediction.inside)
-        x, R = prediction.placed.x[rows], prediction.placed.readings.R_map_lidar[rows]
-        found = errors.errors_over(x)
-        owner, rest = np.full(len(prediction.inside), -1), prediction.map_variance.copy()
-        owner[rows] = found.owner(x)
-        features: dict[int, FloatArray] = {}
-        for tile in found.sizes():
-            own = np.flatnonzero(owner[rows] == tile)
-            A = found.features(x[own], tile)
-            held = np.einsum("nir,nir->ni", A, A)
-            # The weights carry A A^T of the variance; what they leave is noise of each reading:
-            # nothing counts twice.
-            rest[rows[own]] = np.maximum(rest[rows[own]] - held, 0.0)
-            features[tile] = R[own].transpose(0, 2, 1) @ A
-        lower = np.linalg.cholesky(found.covariance)
-        root = solve_triangular(lower, np.eye(len(lower)), lower=True)
-        return cls(owner, features, rest, found.sizes(), root)
-
-    def of(self, rows: IntArray) -> tuple[SharedError, ...]:
-        """Return the shared errors of some readings: zero for readings of other tiles."""
-        errors = []
-        for tile in np.unique(self.owner[rows]).tolist():
-            F = np.zeros((len(rows), 3, self.sizes[tile]))
-            own = self.owner[rows] == tile
-            place = np.searchsorted(np.flatnonzero(self.owner == tile), rows[own])
-            F[own] = self.features[tile][place]
-            errors.append(SharedError(M(tile), F))
-        return tuple(errors)
-
-    def prior(self) -> gtsam.NonlinearFactor:
-        """Return the joint prior of all weights."""
-        return map_weights_prior(self.sizes, self.root_information)
-
-    def values(self) -> gtsam.Values:
-        """Return zero weights: a map without errors."""
-        values = gtsam.Values()
-        for tile, size in self.sizes.items():
-            values.insert(M(tile), np.zeros(size))
-        return values
-
-
-def errors_of(field_map: object) -> UncertainMap:
-    """Return a map's model of its errors; without one no error is shared."""
-    return field_map if isinstance(field_map, UncertainMap) else NothingShared()

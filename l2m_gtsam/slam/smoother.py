@@ -17,14 +17,8 @@ from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, ReadingFits, changed
 from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
-from l2m_gtsam.slam.map_prediction import (
-    SharedMapErrors,
-    errors_of,
-    place_readings,
-    poses_in,
-    predict,
-    sensors_in,
-)
+from l2m_gtsam.slam.map_errors import SharedMapErrors, errors_of
+from l2m_gtsam.slam.map_prediction import place_readings, poses_in, predict, sensors_in
 from l2m_gtsam.slam.marginals import (
     Marginals,
     jump_covariances,
@@ -175,7 +169,7 @@ class SmoothingProblem:
             step = predicted.motions.step_error(own, by_lidar)
             graph.add(key_pose_factor(batch, k, white, errors, step))
         if shared is not None:
-            graph.add(shared.prior())
+            graph.push_back(shared.prior())
         return graph
 
     def finished(self, solved: SmoothingRound) -> DriveSolution:

@@ -26,13 +26,8 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, RigidTransform
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.records.localisation import StartCandidate
-from l2m_gtsam.slam.map_prediction import (
-    MapPrediction,
-    PlacedReadings,
-    SharedMapErrors,
-    errors_of,
-    predict,
-)
+from l2m_gtsam.slam.map_errors import SharedMapErrors, errors_of
+from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, predict
 from l2m_gtsam.slam.start.window import DriveWindow
 from l2m_gtsam.solve.linear_algebra import covariance_root, inverse
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance
