@@ -22,7 +22,7 @@ from l2m_gtsam.calibration.extent import TiledMap
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.map_prediction import MapPrediction
 
-MOST_TILES = 100  # of a group: some 2,000 weights
+MOST_TILES = 40  # of a group: some 1,000 weights
 
 
 @dataclass(frozen=True)
