@@ -149,9 +149,10 @@ def calibrated(
     )
     result = _result(recording, drive, changed, solved_map, options, map_source)
     jumps = tuple(_jump_in_own_time(each, recording) for each in jumping.jumps)
-    taken = f"{extent.note} (`calibration.solve.most_weights`)"
-    notes = (*result.notes, taken) if extent.left_out else result.notes
-    result = replace(result, jumps=jumps, notes=notes)
+    result = replace(result, jumps=jumps)
+    if extent.left_out:
+        taken = f"{extent.note} (`calibration.solve.most_weights`)"
+        result = replace(result, notes=(*result.notes, taken))
     return Calibrated(result, outcome.solution, solved_map, solver_map)
 
 

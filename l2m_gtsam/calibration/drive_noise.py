@@ -15,13 +15,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.alternation import Alternated
 from l2m_gtsam.calibration.trust import residuals
-from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.calibration.view import QueryableMap, StandIns, glimpse
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.solve.robust import MEDIAN
 
-FEWEST = 30  # readings of a drive by which its noise is told
+FEWEST = 30  # readings of a drive that its noise is estimated from
 # Of the logarithm of such a noise, times the root of the readings: by a median that of three
 # squares is 0.56, neighbours have a reading in common.
 SCATTER = 0.65
@@ -29,7 +29,7 @@ SURE_SIGMAS = 4.0  # by which two drives differ, of that
 
 
 def with_drive_noise(
-    readings: Readings, view: View, field_map: QueryableMap, estimate: Estimate
+    readings: Readings, stand_ins: StandIns, field_map: QueryableMap, near: Alternated
 ) -> Readings:
     """Return readings with the noise of their drives, where these differ.
 
@@ -37,14 +37,15 @@ def with_drive_noise(
     ----------
     readings
         Of S sensors.
-    view
-        Those that the map covers.
-    field_map, estimate
-        What they are compared with.
+    stand_ins
+        Those at which the map is asked for its variance.
+    field_map, near
+        What they are compared with: the map, and where sensors are, about.
     """
     if readings.drive is None or readings.relative_noise is not None:
         return readings
-    e, drives = residuals(view.readings, field_map, estimate), int(readings.drive.max()) + 1
+    view = glimpse(readings, stand_ins, field_map, near.estimate, near.asked, FEWEST)
+    e, drives = residuals(view.readings, field_map, near.estimate), int(readings.drive.max()) + 1
     ratio = np.ones((len(readings.sensors), drives))
     for sensor in view.sensors:
         own = view.readings.rows_of(sensor)
@@ -74,14 +75,14 @@ def noise_ratios(residual: FloatArray, drive: IntArray, drives: int) -> FloatArr
     count, squared, ratio = np.bincount(drive, minlength=drives), np.zeros(drives), np.ones(drives)
     step = np.sum(np.diff(residual, axis=0) ** 2, axis=1)
     of_step = np.where(np.diff(drive) == 0, drive[1:], -1)
-    told = np.flatnonzero(count >= FEWEST)
-    for each in told:
+    enough = np.flatnonzero(count >= FEWEST)
+    for each in enough:
         squared[each] = np.median(step[of_step == each]) / (2 * MEDIAN)
-    if len(told) < 2 or not squared[told].all():
+    if len(enough) < 2 or not squared[enough].all():
         return ratio
-    size, sigma = np.log(squared[told]) / 2, SCATTER / np.sqrt(count[told])
+    size, sigma = np.log(squared[enough]) / 2, SCATTER / np.sqrt(count[enough])
     apart = np.abs(size[:, None] - size) / np.hypot(sigma[:, None], sigma)
     if apart.max() < SURE_SIGMAS:
         return ratio
-    ratio[told] = np.sqrt(squared[told] / np.average(squared[told], weights=count[told]))
+    ratio[enough] = np.sqrt(squared[enough] / np.average(squared[enough], weights=count[enough]))
     return ratio

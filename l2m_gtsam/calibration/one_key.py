@@ -27,7 +27,7 @@ from l2m_gtsam.calibration.alternation import (
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.contradiction import is_contradicted
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
-from l2m_gtsam.calibration.drive_noise import FEWEST, with_drive_noise
+from l2m_gtsam.calibration.drive_noise import with_drive_noise
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import (
     JointProblem,
@@ -273,9 +273,8 @@ def _solved(
     some, of_some = some.select(good), of_some.select(good)
     start = start_estimate(t_start, options, priors)
     near = alternate(some, of_some, field_map, start, options, progress)
-    if options.sensor_noise_ut is None and readings.drive is not None:
-        seen = glimpse(readings, stand_ins, field_map, near.estimate, near.asked, FEWEST)
-        readings = with_drive_noise(readings, seen, field_map, near.estimate)
+    if options.sensor_noise_ut is None:
+        readings = with_drive_noise(readings, stand_ins, field_map, near)
     joint = settle(readings, stand_ins, field_map, near, options, progress, trajectory)
     alone = stayed(joint.stayed, joint.readings, field_map, joint.estimate, options)
     joint = replace(joint, estimate=alone.estimate)
