@@ -18,9 +18,9 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.online.belief import POSE
+from l2m_gtsam.slam.selected_inverse import shared_covariances
 from l2m_gtsam.solve.linear_algebra import triangular_information_root
 
-TOGETHER = 200  # poses: the covariance of so many is 11 MB
 Result = TypeVar("Result")
 
 
@@ -92,6 +92,13 @@ class Marginals:
         left = self._qr.joint(own, gtsam.EliminateQR)
         return net_covariance(left.eliminateSequential(ordered(keys), gtsam.EliminateQR), keys)
 
+    def sharing(self, groups: Sequence[Sequence[int]]) -> list[FloatArray]:
+        """Return joint covariances of many groups of variables, each of which shares a factor.
+
+        At the cost of another elimination, however many there are.
+        """
+        return shared_covariances(self._net, groups)
+
     def variance_along(self, directions: Mapping[int, FloatArray]) -> float:
         """Return ``d^T P d`` for a direction d in which variables move together.
 
@@ -132,6 +139,13 @@ class Marginals:
     @cached_property
     def _cholesky(self) -> gtsam.GaussianBayesTree | None:
         return unless_indeterminate(lambda: self._linear.eliminateMultifrontal(self._ordering))
+
+    @cached_property
+    def _net(self) -> gtsam.GaussianBayesNet:
+        net = unless_indeterminate(lambda: self._linear.eliminateSequential(self._ordering))
+        if net is None:
+            net = self._linear.eliminateSequential(self._ordering, gtsam.EliminateQR)
+        return net
 
     @cached_property
     def _qr(self) -> gtsam.GaussianBayesTree:
@@ -228,36 +242,61 @@ def covariance_of(root: FloatArray) -> FloatArray:
     return np.asarray(half @ half.T)
 
 
+@dataclass(frozen=True)
+class DriveCovariances:
+    """Covariances of a drive's variables.
+
+    Attributes
+    ----------
+    poses
+        Of right perturbations of the K key poses, rotation (rad) before translation (m), shape
+        (K, 6, 6).
+    steps
+        Joint ones of the poses before and after odometry's J jumps, shape (J, 12, 12).
+    sensors
+        Of (t, C row by row, H) of the S sensors in m and uT, shape (S, 15, 15); the known ones
+        where calibrations are no variables.
+    """
+
+    poses: FloatArray
+    steps: FloatArray
+    sensors: FloatArray
+
+
+def drive_covariances(
+    marginals: Marginals, drive: Drive, sensors: KnownSensors, values: gtsam.Values
+) -> DriveCovariances:
+    """Return what a drive's graph determines, all at the cost of one elimination.
+
+    Parameters
+    ----------
+    marginals
+        Of the graph.
+    drive
+        K key poses.
+    sensors
+        Its sensors as they were known.
+    values
+        Of the graph's variables.
+    """
+    poses = [[X(k)] for k in range(len(drive))]
+    steps = [[X(each.step), X(each.step + 1)] for each in drive.jumps]
+    free = values.exists(T(0))
+    calibrations = [[T(i), D(i)] for i in range(len(sensors.names))] if free else []
+    with reported_ill_conditioning():
+        found = marginals.sharing([*poses, *steps, *calibrations])
+    K, J = len(poses), len(steps)
+    return DriveCovariances(
+        np.stack(found[:K]),
+        np.reshape(found[K : K + J], (-1, 2 * POSE, 2 * POSE)),
+        np.stack(found[K + J :]) if free else sensors.covariance,
+    )
+
+
 def pose_covariances(marginals: Marginals, count: int) -> FloatArray:
-    """Return covariances of the first ``count`` key poses, shape (K, 6, 6).
-
-    One by one along the elimination tree, at a cost that does not grow with the drive. Of right
-    perturbations, rotation (rad) before translation (m).
-    """
+    """Return covariances of the first ``count`` key poses; see ``DriveCovariances``."""
     with reported_ill_conditioning():
-        return np.stack([marginals.of(X(k)) for k in range(count)])
-
-
-def pose_covariances_together(marginals: Marginals, count: int) -> FloatArray:
-    """Return the same from joint covariances of many poses.
-
-    For graphs in which each path to the root of the elimination tree contains nearly all of it:
-    without a map 0.1 s instead of 3 s for 116 poses, with calibrations that are refined.
-    """
-    blocks: list[FloatArray] = []
-    for first in range(0, count, TOGETHER):
-        keys = [X(k) for k in range(first, min(first + TOGETHER, count))]
-        with reported_ill_conditioning():
-            joint = marginals.joint(keys).reshape(len(keys), POSE, len(keys), POSE)
-        blocks.extend(np.einsum("kikj->kij", joint))
-    return np.stack(blocks)
-
-
-def jump_covariances(marginals: Marginals, drive: Drive) -> FloatArray:
-    """Return joint covariances of the poses before and after odometry's jumps, (J, 12, 12)."""
-    with reported_ill_conditioning():
-        joint = [marginals.joint([X(each.step), X(each.step + 1)]) for each in drive.jumps]
-    return np.reshape(joint, (-1, 2 * POSE, 2 * POSE))
+        return np.stack(marginals.sharing([[X(k)] for k in range(count)]))
 
 
 def odometry_scale(marginals: Marginals, values: gtsam.Values) -> OdometryScale | None:
@@ -267,16 +306,3 @@ def odometry_scale(marginals: Marginals, values: gtsam.Values) -> OdometryScale 
     with reported_ill_conditioning():
         variance = float(marginals.of(G())[0, 0])
     return OdometryScale(values.atDouble(G()), float(np.sqrt(variance)))
-
-
-def sensor_covariances(
-    marginals: Marginals, values: gtsam.Values, known: KnownSensors
-) -> FloatArray:
-    """Return covariances of (t, C row by row, H) of the sensors in m and uT, shape (S, 15, 15).
-
-    The known ones where calibrations are no variables.
-    """
-    if not values.exists(T(0)):
-        return known.covariance
-    with reported_ill_conditioning():
-        return np.stack([marginals.joint([T(i), D(i)]) for i in range(len(known.names))])

@@ -19,13 +19,7 @@ from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, ReadingFits, changed
 from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.map_errors import SharedMapErrors, errors_of
 from l2m_gtsam.slam.map_prediction import place_readings, poses_in, predict, sensors_in
-from l2m_gtsam.slam.marginals import (
-    Marginals,
-    jump_covariances,
-    odometry_scale,
-    pose_covariances,
-    sensor_covariances,
-)
+from l2m_gtsam.slam.marginals import Marginals, drive_covariances, odometry_scale
 from l2m_gtsam.slam.online.follower import Follower, follow
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
@@ -38,7 +32,7 @@ from l2m_gtsam.slam.pose_graph import (
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
-from l2m_gtsam.slam.solver import colamd_ordering, levenberg_marquardt
+from l2m_gtsam.slam.solver import colamd_ordering, gauss_newton
 from l2m_gtsam.solve.robust import WEIGHTS
 
 # Stages of graduated non-convexity: the drive was followed, so that good readings are near already.
@@ -110,9 +104,7 @@ class SmoothingProblem:
         predicted = self.predict(values)
         weights = self.weights(predicted, mu) * counts
         graph = self.graph(predicted, weights, predicted.prediction.map_variance, None)
-        end = levenberg_marquardt(
-            graph, values, colamd_ordering(graph), self._options.max_iterations
-        )
+        end = gauss_newton(graph, values, colamd_ordering(graph), self._options.max_iterations)
         return SmoothingRound(end.values, weights, end.ending)
 
     def fit(self, solved: SmoothingRound, counts: BoolArray) -> ReadingFits:
@@ -184,15 +176,16 @@ class SmoothingProblem:
         rest = predicted.prediction.map_variance if shared is None else shared.rest
         graph = self.graph(predicted, weights, rest, shared)
         order = colamd_ordering(graph)
-        optimised = levenberg_marquardt(graph, values, order, self._options.max_iterations)
+        optimised = gauss_newton(graph, values, order, self._options.max_iterations)
         values, sensors = optimised.values, self.sensors(optimised.values)
         marginals = Marginals(graph.linearize(values), order)
+        covariances = drive_covariances(marginals, self._drive, sensors, values)
         predicted = self.predict(values)
         return DriveSolution(
             drive=replace(self._drive, sensors=sensors),
             poses=poses_in(values, len(self._drive)),
-            pose_covariance=pose_covariances(marginals, len(self._drive)),
-            calibration_covariance=sensor_covariances(marginals, values, sensors),
+            pose_covariance=covariances.poses,
+            calibration_covariance=covariances.sensors,
             prediction=predicted.prediction,
             interpolation_covariance=predicted.interpolation_covariance,
             squared=predicted.squared(sensors.noise),
@@ -203,7 +196,7 @@ class SmoothingProblem:
             steady=steady_drift(values),
             link_squared=link_squared(self._drive.links, values),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,
-            step_covariance=jump_covariances(marginals, self._drive),
+            step_covariance=covariances.steps,
         )
 
 

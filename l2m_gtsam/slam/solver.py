@@ -23,10 +23,48 @@ from collections.abc import Generator, Iterator
 import gtsam
 
 from l2m_factors import M, X
-from l2m_gtsam.calibration.optimise import TOLERANCE, Ending, LinearSolver, Optimised
+from l2m_gtsam.calibration.optimise import (
+    TOLERANCE,
+    Ending,
+    LinearSolver,
+    Optimised,
+    most_after_step,
+)
 from l2m_gtsam.slam.marginals import unless_indeterminate
 
 LAST = (ord("T"), ord("D"), ord("V"))
+
+
+def gauss_newton(
+    graph: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    ordering: gtsam.Ordering,
+    max_iterations: int,
+) -> Optimised:
+    """Minimise a graph's error in a map by Gauss-Newton; by Levenberg-Marquardt where that fails.
+
+    At the seams of a map the error rises a little though the gradient says that it falls.
+    Levenberg-Marquardt would try ever shorter steps there: ten eliminations for each step, and 20
+    of 24 in a drive of two minutes.
+
+    Parameters
+    ----------
+    graph, start, ordering, max_iterations
+        As of ``levenberg_marquardt``.
+    """
+    params = gtsam.GaussNewtonParams()
+    params.setOrdering(ordering)
+    params.setLinearSolverType(LinearSolver.CHOLESKY.value)
+    engine = gtsam.GaussNewtonOptimizer(graph, start, params)
+    for _ in range(max_iterations):
+        before, error = engine.values(), engine.error()
+        step = unless_indeterminate(engine.iterate)
+        if step is None or not engine.error() <= most_after_step(error):
+            left = max_iterations - engine.iterations()
+            return levenberg_marquardt(graph, before, ordering, left)
+        if error - engine.error() <= TOLERANCE * max(error, 1.0):
+            return Optimised(engine.values(), Ending.TOLERANCE)
+    return Optimised(engine.values(), Ending.ITERATION_LIMIT)
 
 
 def levenberg_marquardt(

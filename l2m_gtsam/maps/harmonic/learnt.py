@@ -169,7 +169,7 @@ class Learnt:
         """Rows of the readings that take part in each tile."""
         return self.tiling.grid.members(self.readings.points, self.tiling.overlap)
 
-    @property
+    @cached_property
     def most_variance(self) -> float:
         """Variance of the three axes together beyond which the field is not known, uT^2."""
         varied = float(self.readings.field.var(axis=0).sum())

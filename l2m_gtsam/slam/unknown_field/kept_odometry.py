@@ -8,7 +8,7 @@ import numpy as np
 from l2m_factors import M
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.marginals import Marginals, jump_covariances, pose_covariances
+from l2m_gtsam.slam.marginals import Marginals, drive_covariances
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
     calibration_graph,
@@ -101,6 +101,7 @@ def along_odometry(
     graph, values = drive_graph(drive), drive_values(drive, poses)
     marginals = Marginals(graph.linearize(values), colamd_ordering(graph))
     sensors, robust = drive.sensors, options.robust
+    covariances = drive_covariances(marginals, drive, sensors, values)
     motions = RelativeMotions.along(drive, poses)
     tiled = TiledDrive.lasting(motions, poses, sensors, prior)
     weights = tiled.weights(sensors, sensors.noise)
@@ -109,7 +110,7 @@ def along_odometry(
     solution = DriveSolution(
         drive=drive,
         poses=poses,
-        pose_covariance=pose_covariances(marginals, len(drive)),
+        pose_covariance=covariances.poses,
         calibration_covariance=sensors.covariance,
         prediction=in_map(predicted, tiled, poses, sensors),
         interpolation_covariance=predicted.interpolation_covariance,
@@ -121,7 +122,7 @@ def along_odometry(
         steady=None,
         link_squared=link_squared(drive.links, values),
         ending=Ending.TOLERANCE,
-        step_covariance=jump_covariances(marginals, drive),
+        step_covariance=covariances.steps,
     )
     returns = tiled.anchoring.returns(drive.steps.path, AWAY_M)
     return FieldSolution(solution, tiled, returns, marginals, marginals)

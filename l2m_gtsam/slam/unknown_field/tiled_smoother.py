@@ -18,10 +18,8 @@ from l2m_gtsam.slam.map_prediction import MapPrediction, place_readings, poses_i
 from l2m_gtsam.slam.marginals import (
     Marginals,
     PoseCovariance,
-    jump_covariances,
+    drive_covariances,
     odometry_scale,
-    pose_covariances_together,
-    sensor_covariances,
 )
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
@@ -185,14 +183,15 @@ class TiledProblem:
         drive, sensors = self._drive, solved.sensors
         order = self._ordering(solved.graph, solved.values)
         marginals = Marginals(solved.graph.linearize(solved.values), order)
+        covariances = drive_covariances(marginals, drive, sensors, solved.values)
         motions = RelativeMotions.along(drive, solved.poses)
         tiled = solved.tiled.moved(motions, solved.poses, sensors)
         predicted = DrivePrediction(motions, tiled.prediction(solved.values, sensors))
         solution = DriveSolution(
             drive=replace(drive, sensors=sensors),
             poses=solved.poses,
-            pose_covariance=pose_covariances_together(marginals, len(drive)),
-            calibration_covariance=sensor_covariances(marginals, solved.values, sensors),
+            pose_covariance=covariances.poses,
+            calibration_covariance=covariances.sensors,
             prediction=in_map(predicted, tiled, solved.poses, sensors),
             interpolation_covariance=predicted.interpolation_covariance,
             squared=predicted.squared(sensors.noise),
@@ -203,7 +202,7 @@ class TiledProblem:
             steady=steady_drift(solved.values),
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,
-            step_covariance=jump_covariances(marginals, drive),
+            step_covariance=covariances.steps,
         )
         path = drive.steps.path
         returns = tiled.anchoring.returns(path, AWAY_M)
