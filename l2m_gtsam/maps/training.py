@@ -22,8 +22,9 @@ LEAST_EXTENT = 0.01  # metres
 LEAST_CUBES = 10  # along the longest side, so that thinning never eats a small data set
 NARROW = 0.1  # metres; a drive this close to one line does not determine the field beside it
 SAME_PLACE = 0.05  # metres; edge of a cube in which all readings should agree
-# In microtesla; a gradient of 200 uT/m would be needed, which is found at steel only.
+# In microtesla, beside what the field changes by from reading to reading there.
 DISAGREE = 10.0
+STEEPER = 2.0  # how many times as steep as along the path a field may be across it
 # Twice the strongest field of the Earth, in microtesla.
 STRONG = 130.0
 FEW = 0.01  # of the readings; single spikes are no reason to doubt a survey
@@ -275,23 +276,61 @@ def narrow(points: FloatArray) -> str:
 
 
 def disagreement(readings: TrainingSet) -> str:
-    """Return a sentence if readings of one place differ by more than a field can."""
+    """Return a sentence if readings of one place differ by more than a field can.
+
+    Parameters
+    ----------
+    readings
+        Of one sensor after the other, each in order of time.
+    """
     cubes = np.floor(readings.points / SAME_PLACE).astype(np.int64)
-    _, cube = np.unique(cubes, axis=0, return_inverse=True)
-    high = np.full((cube.max() + 1, 3), -np.inf)
-    low = -high
-    np.maximum.at(high, cube, readings.field)
-    np.minimum.at(low, cube, readings.field)
-    differ = (high - low).max(axis=1)
-    count = int(np.count_nonzero(differ > DISAGREE))
-    if not count:
+    places, cube = np.unique(cubes, axis=0, return_inverse=True)
+    differ = spans(readings.field, cube).max(axis=1)
+    apart = np.linalg.norm(spans(readings.points, cube), axis=1)
+    at = np.flatnonzero(differ > DISAGREE)
+    centres = np.asarray((places[at] + 0.5) * SAME_PLACE, dtype=np.float64)
+    steep = path_slopes(readings, centres)
+    at = at[differ[at] > DISAGREE + STEEPER * steep * apart[at]]
+    if not len(at):
         return ""
-    worst = int(np.argmax(differ))
+    worst = at[np.argmax(differ[at])]
     x, y, z = readings.points[cube == worst][0]
     return (
-        f"readings of one place differ at {count} of {len(differ)} places, by {differ[worst]:.0f} "
-        f"uT at ({x:.1f}, {y:.1f}, {z:.1f}) m: check the suite's calibration, clocks and poses"
+        f"readings of one place differ at {len(at)} of {len(differ)} places, by "
+        f"{differ[worst]:.0f} uT at ({x:.1f}, {y:.1f}, {z:.1f}) m: check the suite's calibration, "
+        f"clocks and poses"
     )
+
+
+def spans(values: FloatArray, group: IntArray) -> FloatArray:
+    """Return from where to where each group's values lie apart, shape (G, 3), of (N, 3)."""
+    high = np.full((group.max() + 1, 3), -np.inf)
+    low = -high
+    np.maximum.at(high, group, values)
+    np.minimum.at(low, group, values)
+    return high - low
+
+
+def path_slopes(readings: TrainingSet, places: FloatArray) -> FloatArray:
+    """Return how much the field changes along the paths beside places, uT/m, shape (M,).
+
+    From one reading of a sensor to its next: whether sensors agree does not matter. The median, so
+    that no spike does, either.
+
+    Parameters
+    ----------
+    readings
+        Of one sensor after the other, each in order of time.
+    places
+        In the map frame in metres, shape (M, 3).
+    """
+    way = np.linalg.norm(np.diff(readings.points, axis=0), axis=1)
+    rows = np.flatnonzero((way > 0.1 * SAME_PLACE) & (way < 2 * SAME_PLACE))
+    if not len(rows) or not len(places):
+        return np.zeros(len(places))
+    rise = np.abs(np.diff(readings.field, axis=0)[rows]).max(axis=1) / way[rows]
+    near = cKDTree(readings.points[rows]).query_ball_point(places, 2 * SAME_PLACE)
+    return np.array([np.median(rise[own]) if own else 0.0 for own in near])
 
 
 def strong(field: FloatArray) -> str:

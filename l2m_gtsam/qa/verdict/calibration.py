@@ -1,5 +1,6 @@
 """The verdict on a calibration: PASS, WARN or FAIL, with reasons in plain sentences."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.verdict.mounting import mounting
 from l2m_gtsam.qa.verdict.places import source_reasons, stretch_head, stretch_tail
-from l2m_gtsam.qa.verdict.repeatability import furthest_shown, repeat
+from l2m_gtsam.qa.verdict.repeatability import furthest_shown, moved, repeat
 from l2m_gtsam.qa.verdict.sensor import (
     WRONG_MAP,
     Case,
@@ -43,6 +44,7 @@ COMMON = (
     "What all sensors of the survey are off by together need not show: it goes one to one into "
     "every t and rotation."
 )
+Rule = Callable[[Case], list[Reason]]
 MANY = 4  # stretches that are listed one by one
 
 
@@ -77,8 +79,7 @@ def judgement_of(result: CalibrationResult, metrics: Measures, options: QaOption
 
 
 def _on_sensor(case: Case) -> SensorVerdict:
-    rules = RULES_OF_A_MISFIT if misfit(case) else RULES
-    reasons = [reason for rule in rules for reason in rule(case)]
+    reasons = [reason for rule in _rules(case) for reason in rule(case)]
     ended = unconverged(case)
     if ended and all(each.level is not Level.FAIL for each in reasons):
         causes = [reason for rule in CAUSES for reason in rule(case) if reason in reasons]
@@ -86,6 +87,13 @@ def _on_sensor(case: Case) -> SensorVerdict:
             reasons.remove(cause)
             ended = [Reason(Level.FAIL, f"{cause.text} {each.text}") for each in ended]
     return SensorVerdict.of(case.sensor.sensor, [*reasons, *ended])
+
+
+def _rules(case: Case) -> tuple[Rule, ...]:
+    if not misfit(case):
+        return RULES
+    # At two places at once it fits none, nor anything that is found of it.
+    return RULES_OF_A_MOVED if moved(case) else RULES_OF_A_MISFIT
 
 
 def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[Reason]:
@@ -101,9 +109,21 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
         reasons.append(Reason(Level.WARN, more))
     # A map of another place is no evidence on this one.
     reasons += disturbance_reasons(result, None)
-    reasons += stated_wrongly(result.stated, None, result.pose_duration)
+    reasons += _beside_moved(cases) or stated_wrongly(result.stated, None, result.pose_duration)
     elsewhere = _wrong_map(cases) or _bent_too_far(cases, result)
     return elsewhere or [*_on_drive(cases), *reasons, *_exact(result)]
+
+
+def _beside_moved(cases: tuple[Case, ...]) -> list[Reason]:
+    """Return what a sensor that stood in two places does to all others: it is no error of poses."""
+    names = [case.sensor.sensor for case in cases if misfit(case) and moved(case)]
+    if not names:
+        return []
+    text = (
+        f"Sigmas of all sensors are larger by what {', '.join(names)} leaves: calibrate the drives "
+        "apart, or leave it out (`bag.fields`)."
+    )
+    return [Reason(Level.WARN, text)]
 
 
 def _of_its_survey(result: CalibrationResult) -> list[Reason]:
@@ -137,7 +157,8 @@ def _exact(result: CalibrationResult) -> list[Reason]:
     if (lasting := result.pose_duration) and lasting.source is DurationSource.FOUND:
         text = f"Errors of poses last {significant(lasting.seconds, 2)} s, by the readings."
         reasons.append(Reason(Level.PASS, text))
-    if found := [each.drive_noise for each in result.sensors if each.drive_noise]:
+    found = [each.drive_noise for each in result.sensors if each.drive_noise]
+    if 2 * len(found) > len(result.sensors):  # of one alone it may have been moved
         sizes = zip(result.bags, np.median(found, axis=0).tolist(), strict=True)
         each = ", ".join(f"{significant(size, 2)} µT in {bag.path}" for bag, size in sizes)
         text = f"Noise differs between drives: {each}. Each reading counts with that of its own."
@@ -281,6 +302,7 @@ RULES = (
     _lower_bounds,
 )
 RULES_OF_A_MISFIT = (saturation, fit, ending)
+RULES_OF_A_MOVED = (saturation, repeat, ending)
 # What may keep a solve from converging: named before that.
 CAUSES = (saturation, _own_stretches, repeat, fit)
 

@@ -169,11 +169,9 @@ def _beyond(halves: Halves, options: QaOptions) -> str:
 
 def _meaning(case: Case, level: Level, difference: str) -> tuple[Level, str]:
     """Return what it means: other sensors saw the same map from the same poses."""
-    others = [each for each in case.others if _compared(each)]
-    same = [differing(each, case.options) is None for each in others]
     # A reading or two say nothing about the others: as many as are worth a warning by themselves.
     disturbed = case.sensor.rejected > case.options.rejected.warn * case.sensor.inside
-    if same and sum(same) > len(same) / 2 and level is Level.FAIL:
+    if _others_repeat(case) and level is Level.FAIL:
         return level, (
             f"It does not hold still: {difference}, while other sensors repeat. It moved on its "
             f"mount, or something magnetic near it did; {_remedy(case)}."
@@ -184,6 +182,19 @@ def _meaning(case: Case, level: Level, difference: str) -> tuple[Level, str]:
             "has changed since it was mapped were rejected; near them others may be a little off."
         )
     return level, f"It does not repeat: {difference}."
+
+
+def _others_repeat(case: Case) -> bool:
+    """Return whether there are other sensors to compare with, most of which repeat."""
+    same = [differing(each, case.options) is None for each in case.others if _compared(each)]
+    return sum(same) > len(same) / 2
+
+
+def moved(case: Case) -> bool:
+    """Return whether a sensor alone, of several, is elsewhere in one of several drives."""
+    if case.metrics is None or case.metrics.drives is None or not _others_repeat(case):
+        return False
+    return any(each.level is Level.FAIL for each in repeat(case))
 
 
 def _remedy(case: Case) -> str:

@@ -177,7 +177,12 @@ def _explained(case: Case) -> list[Reason]:
         f"The map leaves {significant(found.left, 2)} µT of its readings unexplained, a field that "
         f"is the same everywhere {significant(found.without_map, 2)} µT: "
     )
-    if found.unexplained > case.options.unexplained.fail:
+    if fits_elsewhere(case.others, case.options):
+        text += (
+            "the map explains those of other sensors. Something about this sensor changed on the "
+            "drive, or its readings are those of another device."
+        )
+    elif found.unexplained > case.options.unexplained.fail:
         text += (
             "the map does not fit this drive. Is it of this place, and are the poses in its frame? "
             "(Or the field here is too uniform to test the map.)"

@@ -1,100 +1,39 @@
 """Several drives calibrated together: beside each by itself, in any order, and after a knock."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.batch.reports import REPORT_FILE, write_report
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.calibrate import Calibrated, calibrate, calibrated
+from l2m_gtsam.calibration.calibrate import calibrate, calibrated
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.data import Distortion, KnownSensor, Recording, SourceFile, Trajectory
+from l2m_gtsam.data import Recording, SourceFile
 from l2m_gtsam.qa.evaluate import by_drive, evaluate
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import SensorStatus
+from l2m_gtsam.records.error_budget import ErrorCause, StatedSize
 from l2m_gtsam.records.map_diary import UNDATED
-from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.provenance import MapOrigin, NamedSource
-from l2m_gtsam.records.verdict import Level, Verdict
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.record_files import read_metrics, write_metrics
 from tests.drives.degenerate import STRONG, at_height, poses
+from tests.drives.joint import DAY_NS, OPTIONS, Made, knocked, made, monday, recorded, tuesday, way
 from tests.drives.moving import moving_drive
 from tests.drives.moving import options as moving_options
 from tests.drives.uncertain import surveyed
-from tests.drives.verdict import NOISE, NOMINAL, SENSORS, read
-from tests.worlds.exact import DipoleWorld
+from tests.drives.verdict import NOISE, NOMINAL, SENSORS
 
-DAY_NS = 86_400_000_000_000
-OPTIONS = CalibrationOptions(start=NOMINAL)
 # With noise that is given and exact poses and clocks the optimum is a matter of the readings alone.
 PLAIN = CalibrationOptions(
     start=NOMINAL, solve=OneKeyOptions(sensor_noise_ut=NOISE, largest_offset_s=0.0)
 )
-
-
-def way(phase: float, later_ns: int, count: int = 300) -> Trajectory:
-    """Return a figure of eight that begins elsewhere, some time later."""
-    s = np.linspace(0, 1, count) + phase
-    p = at_height(3 * np.sin(6 * s), 2 * np.sin(12 * s), 0.1)
-    path = poses(9 * s, p, 0.15, 0.15)
-    return replace(path, stamp_ns=path.stamp_ns + later_ns)
-
-
-def recorded(
-    name: str,
-    path: Trajectory,
-    seed: int,
-    sensors: tuple[KnownSensor, ...] = SENSORS,
-    place: DipoleWorld = STRONG,
-) -> Recording:
-    """Return what sensors read on a drive."""
-    rng = np.random.default_rng(seed)
-    series = tuple(read(each, path, place, rng) for each in sensors)
-    return Recording(path, series, SourceFile(f"drives/{name}.bag", f"digest of {name}"))
-
-
-def monday() -> Recording:
-    return recorded("monday", way(0.0, 0), 1)
-
-
-def tuesday(sensors: tuple[KnownSensor, ...] = SENSORS) -> Recording:
-    return recorded("tuesday", way(0.4, DAY_NS), 2, sensors)
-
-
-def knocked() -> tuple[KnownSensor, ...]:
-    """The second sensor was moved by 3 cm and turned by 3 degrees."""
-    old = SENSORS[1]
-    turn = Rotation.from_rotvec([0.0, 0.03, 0.04]).as_matrix()
-    moved = KnownSensor(
-        old.sensor,
-        old.t_lidar_mag + np.array([0.03, 0.0, 0.0]),
-        Distortion(turn @ old.distortion.C, old.distortion.H),
-    )
-    return (SENSORS[0], moved, SENSORS[2])
-
-
-@dataclass(frozen=True)
-class Made:
-    """Several drives, their calibration, its figures and the verdict."""
-
-    recording: Recording
-    calibrated: Calibrated
-    metrics: Metrics
-    verdict: Verdict
-
-
-def made(*drives: Recording) -> Made:
-    recording = joined(drives)
-    found = calibrated(recording, STRONG, OPTIONS)
-    metrics = evaluate(recording, found, OPTIONS, QaOptions())
-    return Made(recording, found, metrics, judge(found.result, metrics, QaOptions()))
 
 
 @pytest.fixture(scope="module")
@@ -196,6 +135,26 @@ def test_a_sensor_that_moved_between_drives_is_named(good: Made) -> None:
     np.testing.assert_allclose(away / np.array(later.sigma[:3]), 0, atol=4)
     assert later.turned_deg == pytest.approx(np.rad2deg(0.05), abs=0.3)
     assert all(each.level is Level.PASS for each in bad.verdict.reasons)
+
+
+def test_a_sensor_that_was_moved_is_not_blamed_on_map_and_poses() -> None:
+    """What fits both drives fits neither. Where nothing is rejected the map explains nothing."""
+    bad = made(monday(), tuesday(knocked()))
+    left = [
+        replace(each, fit=replace(each.fit, rms=(0.9 * each.fit.without_map,) * 3))
+        if each.sensor == "mag_1"
+        else each
+        for each in bad.metrics.sensors
+    ]
+    metrics = replace(bad.metrics, sensors=tuple(left))
+    stated = StatedSize(ErrorCause.POSES, 3.8, 400.0)
+    result = replace(bad.calibrated.result, stated=(stated,))
+    verdict = judge(result, metrics, QaOptions())
+    first, *others = verdict["mag_1"].reasons
+    assert "does not hold still" in first.text
+    assert not any("explains" in each.text for each in others)
+    (shared,) = [each.text for each in verdict.reasons if each.level is not Level.PASS]
+    assert "larger by what mag_1 leaves" in shared
 
 
 def test_of_three_drives_the_one_is_named() -> None:
@@ -347,52 +306,6 @@ def cut(whole: Recording, rows: slice, number: int) -> Recording:
     )
     trajectory = replace(path, stamp_ns=stamps, R=path.R[rows], p=path.p[rows])
     return Recording(trajectory, series, SourceFile(f"{number}.bag", str(number)))
-
-
-def noisier(recording: Recording, noise: float, seed: int = 77) -> Recording:
-    """Return a drive with more noise, of that much in all, uT."""
-    rng, more = np.random.default_rng(seed), np.sqrt(noise**2 - NOISE**2)
-    series = tuple(
-        replace(each, field=each.field + rng.normal(0, more, each.field.shape))
-        for each in recording.series
-    )
-    return replace(recording, series=series)
-
-
-def test_a_noisy_drive_beside_a_better_one_takes_nothing_from_it(tmp_path: Path) -> None:
-    """Five times the noise: no reading is wrong, and sigmas are those of both drives' information.
-
-    The drives' noise is found to 4 %, and so are sigmas by each of them; the optimum's own
-    covariance adds a few hundredths (above).
-    """
-    first, second = monday(), noisier(tuesday(), 5 * NOISE)
-    both = made(first, second)
-    result = both.calibrated.result
-    assert both.verdict.level is Level.PASS, both.verdict
-    assert result.disagreements == ()
-    (said,) = [each.text for each in both.verdict.reasons if "Noise differs" in each.text]
-    assert "in drives/monday.bag" in said
-    one, other = (calibrate(each, STRONG, OPTIONS) for each in (first, second))
-    for known in SENSORS:
-        found = result[known.sensor]
-        # What is beyond the truncated loss by chance is one in ten thousand.
-        assert found.rejected <= 1
-        np.testing.assert_allclose(found.drive_noise, [NOISE, 5 * NOISE], rtol=0.15)
-        away = (found.vector() - known.vector()) / np.sqrt(np.diag(found.covariance))
-        assert np.abs(away).max() < 4.5
-        weights = [np.linalg.inv(each[known.sensor].covariance) for each in (one, other)]
-        expected = np.sqrt(np.diag(np.linalg.inv(weights[0] + weights[1])))
-        np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), expected, rtol=0.12)
-    write_calibration(tmp_path / "a.yaml", result)
-    back = read_calibration(tmp_path / "a.yaml")
-    assert back["mag_0"].drive_noise == result["mag_0"].drive_noise
-
-
-def test_drives_alike_have_one_noise(good: Made, tmp_path: Path) -> None:
-    """Their file says nothing of it, as before."""
-    write_calibration(tmp_path / "a.yaml", good.calibrated.result)
-    assert "drive_noise" not in (tmp_path / "a.yaml").read_text()
-    assert all("Noise differs" not in each.text for each in good.verdict.reasons)
 
 
 def test_a_map_that_was_made_from_one_of_the_drives_is_named(good: Made) -> None:

@@ -36,6 +36,24 @@ def test_a_place_with_two_fields_is_named(by: float) -> None:
     assert f"by {by:.0f} uT" in said
 
 
+def pole(points: FloatArray) -> FloatArray:
+    """A magnetic pole at the origin: 300 uT/m at 0.2 m."""
+    away = np.linalg.norm(points, axis=1, keepdims=True)
+    return 1.2 * points / away**3
+
+
+def test_a_steep_field_is_no_two_fields() -> None:
+    """Two sensors along it, 2 cm apart; if one reads 12 uT too much, that is said."""
+    x = np.arange(-0.5, 0.5, 0.02)
+    lanes = [np.column_stack([x, np.full_like(x, y), np.full_like(x, 0.01)]) for y in (0.2, 0.22)]
+    points, field = np.concatenate(lanes), np.concatenate([pole(lane) for lane in lanes])
+    span = max(np.ptp(field[(points[:, 0] >= at) & (points[:, 0] < at + 0.05)]) for at in x)
+    assert span > 12
+    assert doubts(points, field) == ""
+    field[len(x) :, 2] += 12
+    assert "differ at" in doubts(points, field)
+
+
 def test_a_metal_cage_is_named() -> None:
     """300 uT, and nothing is said of a few spikes of this strength."""
     points, field = readings()
