@@ -24,6 +24,11 @@ from l2m_gtsam.slam.held_calibration import held_notes, with_calibration_use
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import key_pose_links, link_stamps
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
+from l2m_gtsam.slam.moved_sensors import (
+    calibration_changes,
+    sensor_to_leave_out,
+    without_series,
+)
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
@@ -98,6 +103,31 @@ def localise(
         )
     if options.start.by_odometry:
         check_frame(field_map, recording)
+    found = localised(recording, field_map, calibration, options, progress, evidence)
+    tried: dict[str, Localisation] = {}
+
+    def without(sensor: str) -> dict[str, float]:
+        rest = without_series(recording, [sensor])
+        tried[sensor] = localised(rest, field_map, calibration, options, progress, evidence)
+        return calibration_changes(calibration, tried[sensor].result)
+
+    out = sensor_to_leave_out(calibration_changes(calibration, found.result), without)
+    if out is None:
+        return found
+    better = tried[out.sensor]
+    notes = (*better.result.notes, out.note())
+    return replace(better, result=replace(better.result, notes=notes))
+
+
+def localised(
+    recording: Recording,
+    field_map: QueryableMap,
+    calibration: CalibrationResult,
+    options: SlamOptions,
+    progress: Progress,
+    evidence: ScanEvidence,
+) -> Localisation:
+    """Return the same with all sensors that are calibrated, whether or not they hold."""
     drive, notes = prepared(recording, calibration, options, evidence)
     options = with_calibration_use(options, drive.sensors, one_field=False)
     solver_map = for_solvers(field_map)

@@ -40,7 +40,7 @@ from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.record import fields_of
 from l2m_gtsam.records.validation import ChiSquare
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.pose_graph import stated_information_root
+from l2m_gtsam.slam.moved_sensors import calibration_change
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.solve.noise import map_covariance
@@ -227,7 +227,6 @@ def _refined(before: CalibrationResult, result: LocalisationResult) -> tuple[Ref
 
 def _change(before: SensorCalibration, after: SensorCalibration) -> RefinedSensor:
     old, new = (each.vector() for each in (before, after))
-    whitened = stated_information_root(before.covariance) @ (new - old)
     low, high = quantile(BAND, len(PARAMETERS))
     return RefinedSensor(
         sensor=before.sensor,
@@ -235,7 +234,9 @@ def _change(before: SensorCalibration, after: SensorCalibration) -> RefinedSenso
         sigma_before=row(np.sqrt(np.diag(before.covariance)), DIGITS),
         after=row(new, DIGITS),
         sigma_after=row(np.sqrt(np.diag(after.covariance)), DIGITS),
-        change=ChiSquare(float(whitened @ whitened), len(PARAMETERS), float(low), float(high)),
+        change=ChiSquare(
+            calibration_change(before, after), len(PARAMETERS), float(low), float(high)
+        ),
     )
 
 

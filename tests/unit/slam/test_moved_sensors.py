@@ -1,0 +1,69 @@
+"""Which of several sensors is no longer as calibrated."""
+
+from collections.abc import Callable
+
+from l2m_gtsam.slam.moved_sensors import sensor_to_leave_out
+
+MANY = {"a": 40.0, "b": 3000.0, "c": 900.0}
+
+
+def answers(
+    left: dict[str, dict[str, float]],
+) -> tuple[list[str], Callable[[str], dict[str, float]]]:
+    """Return what is left without each sensor, and who was asked for."""
+    asked = list[str]()
+
+    def without(sensor: str) -> dict[str, float]:
+        asked.append(sensor)
+        return left[sensor]
+
+    return asked, without
+
+
+def test_calibrations_that_hold_cost_nothing() -> None:
+    asked, without = answers({})
+    assert sensor_to_leave_out({"a": 12.0, "b": 70.0}, without) is None
+    assert sensor_to_leave_out({"a": 1e6}, without) is None
+    assert sensor_to_leave_out({}, without) is None
+    assert asked == []
+
+
+def test_the_plainest_goes_where_the_others_hold_without_it() -> None:
+    asked, without = answers({"b": {"a": 14.0, "c": 20.0}})
+    found = sensor_to_leave_out(MANY, without)
+    assert found is not None
+    assert (found.sensor, found.change) == ("b", 3000.0)
+    assert asked == ["b"]
+    assert "b is left out" in found.note()
+
+
+def test_the_plainest_is_not_always_the_one() -> None:
+    asked, without = answers({"b": {"a": 60.0, "c": 900.0}, "c": {"a": 14.0, "b": 20.0}})
+    found = sensor_to_leave_out(MANY, without)
+    assert found is not None
+    assert found.sensor == "c"
+    assert asked == ["b", "c"]
+
+
+def test_a_wrong_map_is_no_moved_sensor() -> None:
+    """All contradict: with any of them out the others still do."""
+    asked, without = answers({each: {"x": 2500.0} for each in "abcd"})
+    assert sensor_to_leave_out({"a": 2500.0, "b": 3000.0, "c": 2900.0}, without) is None
+    assert asked == ["b", "c", "a"]
+    asked.clear()
+    assert sensor_to_leave_out(dict.fromkeys("abcd", 3000.0), without) is None
+    assert asked == []
+
+
+def test_of_two_each_alone_may_hold_and_neither_is_blamed() -> None:
+    _, without = answers({"a": {"b": 16.0}, "b": {"a": 14.0}})
+    assert sensor_to_leave_out({"a": 800.0, "b": 900.0}, without) is None
+    _, without = answers({"a": {"b": 500.0}, "b": {"a": 14.0}})
+    found = sensor_to_leave_out({"a": 800.0, "b": 900.0}, without)
+    assert found is not None
+    assert found.sensor == "b"
+
+
+def test_where_nothing_is_refined_without_it_nothing_is_left_out() -> None:
+    _, without = answers({"b": {}, "c": {}})
+    assert sensor_to_leave_out(MANY, without) is None
