@@ -1,6 +1,6 @@
 """All poses of a drive in a known magnetic map, estimated together (batch smoothing).
 
-The drive is followed from its start, then all poses are solved together by Levenberg-Marquardt:
+The drive is followed from its start, then all poses are solved together by Gauss-Newton:
 in rounds, with the weights that the residuals of the last round give each reading (graduated
 non-convexity, see ``solve.robust``), at last with the map's errors as variables.
 """
