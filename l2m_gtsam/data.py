@@ -231,7 +231,7 @@ class Recording:
         What was added to the stamps of each drive so that none overlaps another, nanoseconds.
     notes
         What is worth a warning, a sentence each: where its poses come from if the bag has none, or
-        a clock that was set.
+        several topics with some, or a clock that was set.
     origins
         What else it was made from, a sentence each with the hash of the file.
     poses

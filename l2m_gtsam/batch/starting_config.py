@@ -103,16 +103,23 @@ def _pose_file(given: PoseFileOptions, path: Path) -> Iterator[str]:
 
 def _poses(report: BagReport) -> Iterator[str]:
     """Yield where poses come from, and what else has some."""
-    if _used(report, "poses") or any(each.msgtype == POSE_FILE for each in report.topics):
+    if any(each.msgtype == POSE_FILE for each in report.topics):
         return
+    used = {each.topic for each in _used(report, "poses")}
     named = [each for each in report.topics if each.msgtype in ALL_POSE_TYPES and each.count]
+    named.sort(key=lambda each: each.topic not in used)
     for first in named[:1]:
-        yield f"  poses: {json.dumps(first.topic)}  # {first.msgtype}, {first.rate_hz:.3g} Hz"
+        yield f"  poses: {json.dumps(first.topic)}  # {_of_poses(first)}"
     for other in named[1:]:
-        yield f"  # poses: {json.dumps(other.topic)}  # {other.msgtype}, {other.rate_hz:.3g} Hz"
+        yield f"  # poses: {json.dumps(other.topic)}  # {_of_poses(other)}"
     moving = [t for t in report.topics if t.msgtype in TF_TYPES and "tf_static" not in t.topic]
     if not named and moving:
         yield from _chain([t for t in report.topics if t.msgtype in TF_TYPES])
+
+
+def _of_poses(topic: TopicReport) -> str:
+    known = ", with covariance" if "with covariance" in topic.use else ""
+    return f"{topic.msgtype}, {topic.rate_hz:.3g} Hz{known}"
 
 
 def _chain(topics: Sequence[TopicReport]) -> Iterator[str]:

@@ -34,7 +34,13 @@ from l2m_gtsam.storage.messages import (
 from l2m_gtsam.storage.open_bag import Bag
 from l2m_gtsam.storage.open_log import open_log
 from l2m_gtsam.storage.pose_files import read_poses
-from l2m_gtsam.storage.selection import select_fields, select_poses, sensor_names, several_frames
+from l2m_gtsam.storage.selection import (
+    pose_notes,
+    select_fields,
+    select_poses,
+    sensor_names,
+    several_frames,
+)
 from l2m_gtsam.storage.tf import Link, chain_frames, compose
 from l2m_gtsam.storage.units import field_fault, microtesla_per
 
@@ -77,12 +83,13 @@ def read_recording(path: Path, options: BagOptions, progress: Count | None = Non
     with open_log(path, options.columns) as bag:
         fields = select_fields(bag, options)
         poses = [] if apart is not None else select_poses(bag, options)
+        notes = pose_notes(bag, poses, options)
         buffers = _read(bag, fields, poses, options, progress)
         paths = _path_poses(bag, poses, progress)
     series = _all_series(path, buffers, fields, options)
     trajectory = _trajectory(path, buffers, options, paths)
     check_clocks(path, trajectory, series, apart)
-    notes, origins = _clocks(path, buffers, options), tuple[str, ...]()
+    notes, origins = (*notes, *_clocks(path, buffers, options)), tuple[str, ...]()
     notes += order_notes(apart or path, trajectory)
     source = None if apart is None else source_file(apart)
     if source is not None:

@@ -31,7 +31,13 @@ from l2m_gtsam.storage.messages import (
 from l2m_gtsam.storage.open_log import open_log
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
 from l2m_gtsam.storage.pose_files import read_poses
-from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
+from l2m_gtsam.storage.selection import (
+    other_poses,
+    select_fields,
+    select_poses,
+    several_frames,
+    why_poses,
+)
 from l2m_gtsam.storage.topic_content import (
     TopicContent,
     collect_paths,
@@ -80,7 +86,8 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
         if (fault := collect_paths(bag, poses, collected)) and not no_poses:
             no_poses = fault
         uses = {each.connection.topic: "magnetic readings" for each in fields}
-        uses |= {c.topic: f"poses ({_why_poses(options)})" for c in poses}
+        why = why_poses(poses, other_poses(bag, poses), options) if poses else ""
+        uses |= {c.topic: f"poses ({why})" for c in poses}
         topics, duration = _by_topic(bag), max(bag.duration_s, 1e-9)
         reports = [
             _report(topic, connections, collected.get(topic), uses.get(topic), duration, options)
@@ -173,12 +180,6 @@ def _is_usable(connection: Connection) -> bool:
     return connection.msgtype in (*FIELD_TYPES, *POSE_TYPES, *TF_TYPES)
 
 
-def _why_poses(options: BagOptions) -> str:
-    if options.tf is not None:
-        return f"chain {options.tf.frame} to {options.tf.child_frame}"
-    return "named by bag.poses" if options.poses is not None else "the only topic of its kind"
-
-
 def _by_topic(bag: Log) -> dict[str, list[Connection]]:
     topics: dict[str, list[Connection]] = {}
     for connection in sorted(bag.connections, key=lambda c: c.topic):
@@ -253,7 +254,9 @@ def _use(use: str | None, connection: Connection, found: TopicContent, options: 
     if connection.msgtype == PATH_TYPE:
         return "paths, not used: another topic has poses, or choose it with `bag.poses`"
     if connection.msgtype in ALL_POSE_TYPES:
-        return "poses, not used: another topic is preferred or must be chosen with bag.poses"
+        known = ", with covariance" if found.covariances.are_known else ""
+        reason = "another topic is preferred or must be chosen with bag.poses"
+        return f"poses{known}, not used: {reason}"
     if connection.msgtype in TF_TYPES:
         return "transforms, used when bag.tf names a chain"
     if connection.msgtype == CLOUD_TYPE:

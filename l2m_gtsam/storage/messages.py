@@ -57,6 +57,12 @@ class CovarianceBuffer:
             return None
         return np.asarray(((matrices + matrices.swapaxes(1, 2)) / 2)[rows])
 
+    @property
+    def are_known(self) -> bool:
+        """Whether there are poses, and each has a covariance that is usable."""
+        rows = np.array(self.row, dtype=np.int64)
+        return bool(len(rows) and usable(self._matrices())[rows].all())
+
     def account(self) -> str:
         """Return what can be said of all covariances together, as half a sentence."""
         matrices, rows = self._matrices(), np.array(self.row, dtype=np.int64)

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
 from rosbags.interfaces import Connection
@@ -19,7 +19,7 @@ from l2m_gtsam.storage.field_types import (
     named_source,
 )
 from l2m_gtsam.storage.log import Log
-from l2m_gtsam.storage.messages import ALL_POSE_TYPES, TF_TYPES
+from l2m_gtsam.storage.messages import ALL_POSE_TYPES, PATH_TYPE, TF_TYPES
 
 ROS_POSE_TYPES = tuple(each for each in ALL_POSE_TYPES if not each.startswith("csv/"))
 GLOB = re.compile(r"[*?\[]")
@@ -87,9 +87,69 @@ def select_poses(bag: Log, options: BagOptions) -> list[Connection]:
             )
     raise BagError(
         f"{bag.path}: no poses in it; needed is a topic of one of the types "
-        f"{', '.join(each.rpartition('/')[2] for each in ROS_POSE_TYPES)}, a /tf chain named by "
+        f"{', '.join(map(_short, ROS_POSE_TYPES))}, a /tf chain named by "
         f"`bag.tf`, or a file with `--poses`; there are: {listed(bag.connections)}"
     )
+
+
+def other_poses(bag: Log, chosen: Sequence[Connection]) -> list[Connection]:
+    """Return one connection of each topic that has poses beside those that are used.
+
+    Parameters
+    ----------
+    bag
+        The log.
+    chosen
+        Where the poses come from.
+    """
+    used = {c.topic for c in chosen}
+    available = [c for c in bag.connections if c.msgtype in ALL_POSE_TYPES and c.msgcount]
+    found = {c.topic: c for c in available if c.topic not in used}
+    return sorted(found.values(), key=lambda c: (ALL_POSE_TYPES.index(c.msgtype), c.topic))
+
+
+def why_poses(
+    chosen: Sequence[Connection], others: Sequence[Connection], options: BagOptions
+) -> str:
+    """Return in a clause why the poses are those of a topic.
+
+    Parameters
+    ----------
+    chosen, others
+        Where they come from, and which other topics have some.
+    options
+        What was asked for.
+    """
+    if options.tf is not None:
+        return f"chain {options.tf.frame} to {options.tf.child_frame}"
+    if options.poses is not None:
+        return "named by bag.poses"
+    if not others:
+        return "the only topic of its kind"
+    told = ", ".join(f"{c.topic} ({_short(c.msgtype)})" for c in others[:10])
+    return f"{_short(chosen[0].msgtype)} is preferred to {told}; `bag.poses` chooses"
+
+
+def pose_notes(bag: Log, chosen: Sequence[Connection], options: BagOptions) -> tuple[str, ...]:
+    """Return a sentence on which poses are used, where other topics have some and none is named.
+
+    A path beside other poses is no other source: most repeat them, or are plans.
+
+    Parameters
+    ----------
+    bag, chosen, options
+        The log, where the poses come from, and what was asked for.
+    """
+    others = [c for c in other_poses(bag, chosen) if c.msgtype != PATH_TYPE]
+    named = options.tf is not None or options.poses is not None
+    if named or not chosen or not others:
+        return ()
+    why = why_poses(chosen, others, options)
+    return (f"{bag.path}: poses are those of {chosen[0].topic}: {why}",)
+
+
+def _short(msgtype: str) -> str:
+    return msgtype.rpartition("/")[2]
 
 
 def matches(topic: str, pattern: str) -> bool:

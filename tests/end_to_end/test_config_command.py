@@ -85,6 +85,28 @@ def test_a_configuration_to_start_from(tmp_path: Path, scale: float, line: str |
     assert '# poses: "/wheels"' in (tmp_path / "start.yaml").read_text()
 
 
+def test_a_configuration_names_the_poses(tmp_path: Path) -> None:
+    """Those that are taken if nothing is said, and the other candidates as comments."""
+    make, entries = ros("mcap"), []
+    for k in range(40):
+        stamp = START + k * 100_000_000
+        field = 1e-6 * (np.array([20, 5, -40]) + 5 * np.sin([k, 2 * k, 3 * k]))
+        place = ([0.1 * k, 0, 0], [0, 0, 0, 1])
+        one = make.pose_stamped(stamp, *place)
+        other = make.transform(stamp, "map", "lidar", *place)
+        entries += [
+            Entry("/mag", "sensor_msgs/MagneticField", stamp, make.magnetic(stamp, field)),
+            Entry("/slam", "geometry_msgs/PoseStamped", stamp, one),
+            Entry("/mocap", "geometry_msgs/TransformStamped", stamp, other),
+        ]
+    bag = write(tmp_path, "mcap", entries)
+    text = l2m("config", "--for", bag).out
+    assert '  poses: "/slam"  # geometry_msgs/msg/PoseStamped, 10 Hz\n' in text
+    assert '  # poses: "/mocap"  # geometry_msgs/msg/TransformStamped, 10 Hz\n' in text
+    (tmp_path / "start.yaml").write_text(text)
+    assert load_config(tmp_path / "start.yaml").bag.poses == "/slam"
+
+
 def test_what_is_missing_is_a_comment(tmp_path: Path) -> None:
     make = ros("mcap")
     entries = [

@@ -1,5 +1,6 @@
 """Covariances of poses in bags: read, moved to the lidar, or taken as unknown."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -134,3 +135,22 @@ def test_a_pose_that_is_not_used_does_not_count(tmp_path: Path) -> None:
     trajectory = read_trajectory(path, BagOptions())
     assert len(trajectory) == COUNT
     assert trajectory.covariance is not None
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_poses_of_another_topic_are_named(tmp_path: Path, kind: str) -> None:
+    """Which are used and why, and how others are chosen; nothing where they were."""
+    odometry = poses(kind, [np.zeros((6, 6))] * COUNT)
+    other = [e for e in poses(kind, ALL, stamped=True) if e.topic == "/pose"]
+    both = [*odometry, *(replace(each, topic="/lio") for each in other)]
+    path = write(tmp_path, kind, sorted(both, key=lambda e: e.record_ns))
+    why = "Odometry is preferred to /lio (PoseWithCovarianceStamped); `bag.poses` chooses"
+    lio, _, used = inspect_bag(path, BagOptions()).topics
+    assert used.use.startswith(f"poses ({why}), their covariance is unknown")
+    assert lio.use.startswith("poses, with covariance, not used")
+    found = read_recording(path, BagOptions())
+    assert found.notes == (f"{path}: poses are those of /pose: {why}",)
+    assert found.trajectory.covariance is None
+    chosen = BagOptions(poses="/lio")
+    assert read_recording(path, chosen).notes == ()
+    assert inspect_bag(path, chosen).topics[0].use == "poses (named by bag.poses), with covariance"

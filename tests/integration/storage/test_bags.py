@@ -303,6 +303,17 @@ def test_inspect_tells_what_would_be_used(tmp_path: Path) -> None:
     assert report.obstacles == ()
 
 
+def test_a_path_beside_poses_is_no_note(tmp_path: Path) -> None:
+    """Most paths repeat the poses; `inspect` lists them all the same."""
+    make, content = ros("mcap"), entries("mcap")
+    poses = [make.pose_stamped(START + k * STEP, [0, 0, 0], [0, 0, 0, 1]) for k in range(3)]
+    path = make("nav_msgs/Path", header=make.header(START, "map"), poses=poses)
+    bag = write(tmp_path, "mcap", [*content, Entry("/path", "nav_msgs/Path", START, path)])
+    assert not any("are those of" in each for each in read_recording(bag, BagOptions()).notes)
+    (pose,) = (t for t in inspect_bag(bag, BagOptions()).topics if t.topic == "/pose")
+    assert pose.use == "poses (PoseStamped is preferred to /path (Path); `bag.poses` chooses)"
+
+
 def test_inspect_reports_instead_of_refusing(tmp_path: Path) -> None:
     content = [
         e for e in entries("mcap", field=lambda k: 1e4 * EARTH * (1 + k / 100)) if e.topic == "/mag"
