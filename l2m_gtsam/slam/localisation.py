@@ -236,18 +236,13 @@ def usable_sensors(
     usable, notes, dead = [], list[str](), list[str]()
     for series in recording.series:
         entry = entries.get(series.sensor)
-        if entry is None:
-            notes.append(f"{series.sensor} is left out: it has no calibration")
-        elif not is_determined(entry):
-            notes.append(f"{series.sensor} is left out: its calibration is {entry.status.value}")
-        elif entry.moving:
-            numbers = ", ".join(each.name for each in entry.moving)
-            notes.append(f"{series.sensor} is left out: a part of its readings follows {numbers}")
+        if entry is None or why_unusable(entry):
+            notes.append(left_out(series.sensor, why_unusable(entry)))
         elif is_dead(series):
             dead.append(series.sensor)
         else:
             usable.append(entry)
-    notes += [f"{each} is left out: {DEAD}" for each in dead]
+    notes += [left_out(each, DEAD) for each in dead]
     if dead and not usable:
         raise SyncError(f"{recording.source.path}: {', '.join(dead)}: {DEAD}")
     if not usable:
@@ -257,6 +252,21 @@ def usable_sensors(
             f"calibration has {', '.join(entries) or 'no sensor'}"
         )
     return tuple(usable), tuple(notes)
+
+
+def left_out(sensor: str, reason: str) -> str:
+    """Return that a sensor is left out and why, a sentence."""
+    return f"{sensor} is left out: {reason}"
+
+
+def why_unusable(entry: SensorCalibration | None) -> str:
+    """Return why a sensor's readings cannot be used, a clause; nothing if they can."""
+    if entry is None:
+        return "it has no calibration"
+    if not is_determined(entry):
+        return f"its calibration is {entry.status.value}"
+    numbers = ", ".join(each.name for each in entry.moving)
+    return f"a part of its readings follows {numbers}" if numbers else ""
 
 
 def is_determined(sensor: SensorCalibration) -> bool:

@@ -5,9 +5,10 @@ since the one before, after a delay in which late readings may come. What cannot
 and reported. What waits is bounded: of a parked vehicle every other pose and reading is dropped.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral
+from types import MappingProxyType
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from l2m_gtsam.slam.drift import steady_share
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import Links
+from l2m_gtsam.slam.localisation import left_out, why_unusable
 from l2m_gtsam.slam.odometry import FixedStep, odometry_steps
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, ScanAtKeyPose
@@ -89,17 +91,23 @@ class Intake:
     drift_axes
         Ratio of a steady drift's standard deviation along each axis to that of `slam.drift`, (3,),
         where the estimator knows one; for others it is part of each step's own error.
+    unusable
+        Why the calibrations of other sensors cannot be used, clauses by name.
     """
 
     def __init__(
-        self, sensors: KnownSensors, options: SlamOptions, drift_axes: FloatArray | None
+        self,
+        sensors: KnownSensors,
+        options: SlamOptions,
+        drift_axes: FloatArray | None,
+        unusable: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self._known, self._options, self._online = sensors, options, options.online
         self._drift_axes = drift_axes
         self._index = {name: i for i, name in enumerate(sensors.names)}
         self.state = IntakeState(sensors=[SensorBuffer() for _ in sensors.names])
         self._looked_at = 1
-        self._strangers = set[str]()
+        self._unusable, self._strangers = unusable, set[str]()
         self._implausible = set[str]()  # sensors that were reported to read no field
         self._scans: list[Scan] = []
         self._held: OdometryPose | None = None  # ahead of the last, or older: the next one decides
@@ -280,7 +288,7 @@ class Intake:
     def _meet_stranger(self, stamp_ns: int, sensor: str) -> None:
         if sensor not in self._strangers and len(self._strangers) < MOST_POSES:
             self._strangers.add(sensor)
-            text = f"{sensor} is left out: it has no calibration that can be used"
+            text = left_out(sensor, self._unusable.get(sensor) or why_unusable(None))
             self._report(stamp_ns, EventKind.UNUSABLE, text)
 
     def _check_step(self, before: OdometryPose, pose: OdometryPose) -> None:

@@ -23,7 +23,7 @@ from l2m_gtsam.records.localisation import StartVerdict
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose, as_transform
 from l2m_gtsam.slam.held_calibration import with_calibration_use
-from l2m_gtsam.slam.localisation import is_determined, known_sensors, start_pose
+from l2m_gtsam.slam.localisation import known_sensors, left_out, start_pose, why_unusable
 from l2m_gtsam.slam.online.arguments import refuse_unusable
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.branches import Branch, BranchedFollower, GapDoubt
@@ -148,10 +148,11 @@ class OnlineSlam:
         matcher: ScanMatcher | LoopMatcher | None = None,
     ) -> None:
         refuse_unusable(calibration, options, field_map)
-        usable = tuple(each for each in calibration.sensors if is_determined(each))
-        usable = tuple(each for each in usable if not each.moving)
+        reasons = {each.sensor: why_unusable(each) for each in calibration.sensors}
+        usable = tuple(each for each in calibration.sensors if not reasons[each.sensor])
         if not usable:
-            raise CalibrationError("no sensor has a calibration that can be used")
+            told = "; ".join(left_out(name, reason) for name, reason in reasons.items())
+            raise CalibrationError(f"no sensor has a calibration that can be used: {told}")
         self._one_field = field_map is None and matcher is None and len(usable) == 1
         refuse_offline_only(options, has_map=field_map is not None, one_field=self._one_field)
         self.sensors = self.given_sensors = known_sensors(usable)
@@ -160,7 +161,8 @@ class OnlineSlam:
         self.matcher = matcher
         axes = None if field_map is None else np.array([1.0, 1.0, options.drift.of_height])
         # The axes of the one field are the first key pose's, of which none need be vertical.
-        self.intake = Intake(self.sensors, options, np.ones(3) if self._one_field else axes)
+        axes = np.ones(3) if self._one_field else axes
+        self.intake = Intake(self.sensors, options, axes, reasons)
         self.estimator: Estimator | None = None
         self.search: StartSearchState | None = None
         self.base, self.stamp_ns = 0, 0  # number of the first key pose, time of the last

@@ -1,22 +1,31 @@
 """Messages on line that are late, ahead, twice there, or none at all."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from l2m_gtsam.data import RigidTransform
-from l2m_gtsam.errors import InputError
+from l2m_gtsam.errors import CalibrationError, InputError
+from l2m_gtsam.records.calibration import SensorStatus
+from l2m_gtsam.records.sensor_models import MovingField
+from l2m_gtsam.slam.localisation import usable_sensors
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose
 from l2m_gtsam.slam.online.replay import FieldReading, Message, messages
-from l2m_gtsam.slam.online.session import OnlinePose
+from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from tests.drives.online import (
+    OPTIONS,
+    WORLD,
     Hall,
     OnlineRun,
     driven,
     in_map,
 )
+from tests.drives.slam import calibrated
+
+CURRENT = MovingField("current", np.ones(3), np.ones(3))
 
 
 def test_stamps_out_of_order_are_left_out(hall: Hall, plain: OnlineRun) -> None:
@@ -66,6 +75,33 @@ def test_a_first_message_of_another_year_is_taken_back(hall: Hall, plain: Online
     run = driven(in_map(hall), [reading, replace(first, stamp_ns=late), *given])
     assert run.kinds.count(EventKind.OUT_OF_ORDER) == 2
     np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"moving": (CURRENT,)}, "a part of its readings follows current"),
+        ({"status": SensorStatus.AMBIGUOUS, "noise": np.nan}, "its calibration is ambiguous"),
+        ({"sensor": "other"}, "it has no calibration"),
+    ],
+)
+def test_a_sensor_is_left_out_on_line_for_the_reason_of_off_line(
+    hall: Hall, changed: dict[str, Any], reason: str
+) -> None:
+    known, recording = calibrated(hall[0]), hall[1].recording
+    first, second = known.sensors
+    left = replace(known, sensors=(first, replace(second, **changed)))
+    _, told = usable_sensors(recording, left)
+    assert told == (f"{second.sensor} is left out: {reason}",)
+    run = driven(OnlineSlam(left, OPTIONS, WORLD), list(messages(recording))[:300])
+    assert tuple(run.texts(EventKind.UNUSABLE)) == told
+
+
+def test_why_no_sensor_can_be_used_is_said(hall: Hall) -> None:
+    known = calibrated(hall[0])
+    none = replace(known, sensors=tuple(replace(e, moving=(CURRENT,)) for e in known.sensors))
+    with pytest.raises(CalibrationError, match=r"can be used: mag_00 is left out: a part of its"):
+        OnlineSlam(none, OPTIONS, WORLD)
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e-2])
