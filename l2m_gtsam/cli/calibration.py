@@ -108,7 +108,13 @@ def plan(
     """
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import plan_bag
-        from l2m_gtsam.cli.tables.drives import advice, held_plan_note, motion_table, plan_table
+        from l2m_gtsam.cli.tables.drives import (
+            advice,
+            held_plan_note,
+            motion_table,
+            noise_note,
+            plan_table,
+        )
         from l2m_gtsam.config import load_config, with_poses
         from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
@@ -116,6 +122,7 @@ def plan(
         places = [_place(text) for text in at or []]
         found = plan_bag(bag, map_path, chosen, places, progress)
     print_table(plan_table(found), wide)
+    say(noise_note(found))
     if held := held_plan_note(found):
         say(held)
     print_table(motion_table(found), wide)

@@ -38,7 +38,7 @@ from l2m_gtsam.planning.motion import (
     strongest,
 )
 from l2m_gtsam.progress import Progress, reported, silent
-from l2m_gtsam.records.plan import DrivePlan, MotionPlan, SensorPlan, Worst
+from l2m_gtsam.records.plan import DrivePlan, MotionPlan, NoiseSource, SensorPlan, Worst
 from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
 
@@ -126,7 +126,7 @@ def plan(
     synchronised = prepare(recording, options)
     readings = synchronised.readings
     solver_map = for_solvers(field_map)
-    noise = _noise(field_map, options, planning)
+    noise, noise_source = _noise(field_map, options, planning)
     priors = priors_of(options.priors, readings.sensors)
     t = _places(readings.sensors, options, priors)
     extent = extent_of(readings, solver_map, t, options.solve.most_weights)
@@ -149,6 +149,7 @@ def plan(
     return DrivePlan(
         sensors=sensors,
         noise=noise,
+        noise_source=noise_source,
         uncertainty=found.uncertainty,
         worst=one.worst(alone),
         motions=motions,
@@ -224,13 +225,16 @@ def worst(sensor: str, covariance: FloatArray, rank: RankOptions) -> Worst:
     return Worst(unknown, sensor, PARAMETERS[least], float(sigma[least]), float(share[least]))
 
 
-def _noise(field_map: QueryableMap, options: CalibrationOptions, planning: PlanOptions) -> float:
+def _noise(
+    field_map: QueryableMap, options: CalibrationOptions, planning: PlanOptions
+) -> tuple[float, NoiseSource]:
     """Return the noise to assume in uT: as given, else that of the mapping suite."""
     if options.solve.sensor_noise_ut is not None:
-        return options.solve.sensor_noise_ut
-    if isinstance(field_map, Summarised):
-        return float(field_map.summary.facts.get(NOISE_FACT, planning.noise_ut))
-    return planning.noise_ut
+        return options.solve.sensor_noise_ut, NoiseSource.GIVEN
+    facts = field_map.summary.facts if isinstance(field_map, Summarised) else {}
+    if NOISE_FACT in facts:
+        return float(facts[NOISE_FACT]), NoiseSource.MAP
+    return planning.noise_ut, NoiseSource.ASSUMED
 
 
 def _places(sensors: tuple[str, ...], options: CalibrationOptions, priors: Priors) -> FloatArray:

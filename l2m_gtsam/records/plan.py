@@ -4,12 +4,24 @@ Frames and units are those of ``data``.
 """
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.by_sensor import BySensor
 from l2m_gtsam.records.calibration import Uncertainty
+
+
+class NoiseSource(StrEnum):
+    """Where the noise that a plan assumes is from."""
+
+    GIVEN = "given"
+    """`calibration.solve.sensor_noise_ut` states it."""
+    MAP = "map"
+    """The map has that of the sensors that surveyed it."""
+    ASSUMED = "assumed"
+    """`plan.noise_ut`: nothing else is known."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +115,9 @@ class DrivePlan(BySensor[SensorPlan]):
     sensors
         One entry per sensor.
     noise
-        Standard deviation of the sensors' noise in uT that is assumed.
+        Standard deviation of the sensors' noise in uT that is assumed, of each the same.
+    noise_source
+        Where it is from.
     uncertainty
         How the map's errors are counted.
     worst
@@ -119,6 +133,7 @@ class DrivePlan(BySensor[SensorPlan]):
 
     sensors: tuple[SensorPlan, ...]
     noise: float
+    noise_source: NoiseSource
     uncertainty: Uncertainty
     worst: Worst
     motions: tuple[MotionPlan, ...]

@@ -7,7 +7,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from l2m_gtsam.cli.tables import add_numbers, add_text, new_table, plain_table, sigmas_cell
-from l2m_gtsam.records.plan import DrivePlan, SensorPlan, Worst
+from l2m_gtsam.records.plan import DrivePlan, NoiseSource, SensorPlan, Worst
 from l2m_gtsam.storage.bag_report import BagReport, TopicReport
 from l2m_gtsam.text import in_unit, sigma_alone
 
@@ -36,6 +36,27 @@ def held_plan_note(plan: DrivePlan) -> str:
     first, reason = next(iter(held.items()))
     more = f" and {len(held) - 1} more" if len(held) > 1 else ""
     return f"time offset of {first}{more} will be {reason}"
+
+
+NOISE_SOURCES = {
+    NoiseSource.GIVEN: "that of `calibration.solve.sensor_noise_ut`",
+    NoiseSource.MAP: "that of the survey's sensors, by the map",
+    NoiseSource.ASSUMED: "that of `plan.noise_ut`, as the map states none",
+}
+
+
+def noise_note(plan: DrivePlan) -> str:
+    """Return which noise is assumed of which sensors, where it is from, and how to state it."""
+    names = ", ".join(each.sensor for each in plan.sensors[:10])
+    more = f" and {len(plan.sensors) - 10} more" if len(plan.sensors) > 10 else ""
+    source = NOISE_SOURCES[plan.noise_source]
+    told = f"noise of {names}{more} is taken as {plan.noise:.3g} uT: {source}"
+    if plan.noise_source is NoiseSource.GIVEN:
+        return told
+    return (
+        f"{told}; their own is not known, and if it is larger, so are sigmas: state it with "
+        "`calibration.solve.sensor_noise_ut`"
+    )
 
 
 def motion_table(plan: DrivePlan) -> Table:

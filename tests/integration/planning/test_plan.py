@@ -9,12 +9,14 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.cli.tables.drives import noise_note
 from l2m_gtsam.data import FieldSeries, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.planning.plan import assumed_recording, plan
 from l2m_gtsam.records.calibration import Uncertainty
+from l2m_gtsam.records.plan import NoiseSource
 from tests.drives.degenerate import STRONG, eight
 from tests.worlds.harmonic import PRIOR, fitted_map
 
@@ -85,9 +87,18 @@ def test_readings_do_not_matter() -> None:
 
 def test_the_noise_is_given_or_the_maps_or_assumed(learnt: HarmonicMap) -> None:
     recording, open_ = ideal(STRONG), options(OneKeyOptions())
-    assert plan(recording, STRONG, options(), PlanOptions()).noise == GIVEN.sensor_noise_ut
-    assert plan(recording, learnt, open_, PlanOptions()).noise == PRIOR.noise
-    assert plan(recording, STRONG, open_, PlanOptions(noise_ut=0.7)).noise == 0.7
+    given = plan(recording, STRONG, options(), PlanOptions())
+    assert (given.noise, given.noise_source) == (GIVEN.sensor_noise_ut, NoiseSource.GIVEN)
+    of_map = plan(recording, learnt, open_, PlanOptions())
+    assert (of_map.noise, of_map.noise_source) == (PRIOR.noise, NoiseSource.MAP)
+    assumed = plan(recording, STRONG, open_, PlanOptions(noise_ut=0.7))
+    assert (assumed.noise, assumed.noise_source) == (0.7, NoiseSource.ASSUMED)
+    assert noise_note(given) == (
+        "noise of mag is taken as 0.1 uT: that of `calibration.solve.sensor_noise_ut`"
+    )
+    assert "that of the survey's sensors" in noise_note(of_map)
+    assert "is taken as 0.7 uT: that of `plan.noise_ut`" in noise_note(assumed)
+    assert all("state it with `calibration." in noise_note(each) for each in (of_map, assumed))
 
 
 def test_a_place_for_an_unknown_sensor_is_refused() -> None:
