@@ -12,7 +12,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.records.error_budget import ErrorCause, StatedSize
+from l2m_gtsam.records.error_budget import FACTOR, ErrorCause, StatedSize
 from l2m_gtsam.solve.noise import NOISE_RANGE
 from l2m_gtsam.solve.variance_components import WeightSystem
 
@@ -101,6 +101,33 @@ def leave_noise(stated: Sequence[StatedSize], noise: FloatArray) -> bool:
 def noise_is_short(stated: Sequence[StatedSize]) -> bool:
     """Return whether noise was stated so small that all that is found would be noise."""
     return any(e.cause is ErrorCause.NOISE and e.is_wrong and e.ratio > 1 for e in stated)
+
+
+def poses_too_small(stated: Sequence[StatedSize]) -> bool:
+    """Return whether errors of poses are larger than was stated."""
+    return any(e.cause is ErrorCause.POSES and e.is_wrong and e.ratio > 1 for e in stated)
+
+
+def shown_by_one(
+    stated: Sequence[StatedSize], without: Sequence[StatedSize], sensor: str
+) -> tuple[StatedSize, ...]:
+    """Return sizes where errors of poses that a sensor alone shows are said of that sensor.
+
+    What is wrong with poses shows in all sensors.
+
+    Parameters
+    ----------
+    stated, without
+        What all sensors show, and what those without it do.
+    sensor
+        Its name.
+    """
+    poses = [each for each in without if each.cause is ErrorCause.POSES]
+    if not poses or any(each.ratio >= FACTOR for each in poses):
+        return tuple(stated)
+    return tuple(
+        replace(each, sensor=sensor) if each.cause is ErrorCause.POSES else each for each in stated
+    )
 
 
 def beside_processes(

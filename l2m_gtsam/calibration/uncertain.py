@@ -12,7 +12,7 @@ solve took 0.54 s of a processor so, 0.70 s with sensors last, 0.76 s and more w
 METIS was as fast, but GTSAM 4.3 can crash in it. QR is for graphs that Cholesky refuses.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -21,14 +21,20 @@ import numpy as np
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
-from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, Searched, search
+from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, FoundProcess, Searched, search
 from l2m_gtsam.calibration.budget.unseen_warp import unseen_warp
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver, Optimised
 from l2m_gtsam.calibration.parts_alone import ByParts
-from l2m_gtsam.calibration.stated_sizes import beside_processes, leave_noise, noise_is_short
+from l2m_gtsam.calibration.stated_sizes import (
+    beside_processes,
+    leave_noise,
+    noise_is_short,
+    poses_too_small,
+    shown_by_one,
+)
 from l2m_gtsam.calibration.uncertain_graph import (
     UncertainDrive,
     UncertainProblem,
@@ -138,6 +144,13 @@ def solve_uncertain(
     if short:
         left = found.estimate.noise / near.noise
         stated = beside_processes(stated, view.readings.sensors, left)
+    suspect = moved_most(shown.found)
+    if suspect is not None and poses_too_small(stated) and len(view.sensors) > 1:
+        others = [s for s in view.sensors if s != suspect]
+        part = view.select(view.readings.sensor != suspect, others)
+        without = step_to_optimum(part, field_map, errors, near, tests, options).optimum
+        name = view.readings.sensors[suspect]
+        stated = shown_by_one(stated, without.stated(None), name)
     optimum = found.optimum
     solved, size = optimum.by_cause(optimum.solutions()), None
     if known is not None and options.warp_m > 0 and found.drive.budget.warp is None:
@@ -179,6 +192,13 @@ def check_by_parts(
         found.unsettled,
         by_parts=found.optimum.by_parts(),
     )
+
+
+def moved_most(found: Sequence[FoundProcess]) -> int | None:
+    """Return the sensor whose H changes on the drive most clearly, if that of any does."""
+    changing = (DisturbanceKind.MOVING_PARTS, DisturbanceKind.WANDER)
+    own = [each for each in found if each.process.kind in changing]
+    return max(own, key=lambda each: each.gain).process.sensor if own else None
 
 
 @dataclass(frozen=True)
@@ -262,6 +282,21 @@ def step_uncertain(
     From the optimum with independent errors that is exact but for products of C and shared errors.
     Parameters are those of ``solve_uncertain``, and processes that are known beforehand.
     """
+    step = step_to_optimum(view, field_map, errors, near, tests, options, budget)
+    solved = step.optimum.solutions()
+    return UncertainSolution(step.estimate, solved, step.ending, step.unsettled)
+
+
+def step_to_optimum(
+    view: View,
+    field_map: QueryableMap,
+    errors: UncertainMap,
+    near: Estimate,
+    tests: Mapping[int, Determinacy],
+    options: OneKeyOptions,
+    budget: Budget = NOTHING_FOUND,
+) -> Settled:
+    """Return where such a step ends. Parameters are those of ``step_uncertain``."""
     places = ReadingPlaces.of(view.readings, field_map, near)
     drive = UncertainDrive.of(view, field_map, errors, near, options, budget.at(places))
     problem = UncertainProblem(drive, near, tests, options.factors)
@@ -271,8 +306,8 @@ def step_uncertain(
         problem = UncertainProblem(drive, near, tests, options.factors, readings=likely)
         step = step_by_any(problem, step.values)
     estimate = near.updated(step.values, view.sensors)
-    solved = UncertainOptimum.at(problem, step.values).solutions()
-    return UncertainSolution(estimate, solved, step.ending, frozenset())
+    optimum = UncertainOptimum.at(problem, step.values)
+    return Settled(optimum, estimate, step.ending, frozenset())
 
 
 def step_by_any(problem: UncertainProblem, values: gtsam.Values) -> Optimised:

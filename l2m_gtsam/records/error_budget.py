@@ -227,7 +227,7 @@ class StatedSize:
     gain
         Twice the logarithm by which the readings are more likely with it than as stated.
     sensor
-        Which sensor's; all if none is named.
+        Which sensor's, or the one that alone shows errors of poses; all if none is named.
     """
 
     cause: ErrorCause

@@ -7,6 +7,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, SaturatedAxis
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.uncertainty import moves
 from l2m_gtsam.recording.saturation import saturation_sentence
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
@@ -32,6 +33,13 @@ WORSE = 1.5  # of what a uniform field leaves of the readings: the map contradic
 WRONG_MAP = (
     "The map does not fit this drive: a field that is the same everywhere explains the readings as "
     "well. Is it the map of this place, and are the poses in its frame?"
+)
+
+
+OF_MOTION = "The likely cause: its H follows how the vehicle moves."
+OF_OTHERS = (
+    "Errors of poses that the bag does not state, a map frame that is warped, an offset H that "
+    "drifts or a mapping suite that is not calibrated do that."
 )
 
 
@@ -248,11 +256,10 @@ def _unmodelled(case: Case) -> list[Reason]:
     named = [f"of {name} {ratio**0.5:.1f} times" for name, ratio in times.items() if ratio > 1]
     if not named:
         return []
+    cause = OF_MOTION if moves(case.result, case.sensor.sensor) else OF_OTHERS
     text = (
         "Parts of the drive disagree by more than noise, map and poses explain: its sigmas are "
-        f"larger by what is unmodelled ({', '.join(named)}). Errors of poses that the bag does not "
-        "state, a map frame that is warped, an offset H that drifts or a mapping suite that is not "
-        "calibrated do that."
+        f"larger by what is unmodelled ({', '.join(named)}). {cause}"
     )
     return [Reason(Level.WARN, text)]
 

@@ -84,6 +84,12 @@ def stated_wrongly(
 
 
 def _wrong(found: StatedSize, lasting: PoseDuration | None) -> str:
+    if found.cause is ErrorCause.POSES and found.sensor is not None:
+        return (
+            f"{found.sensor} alone shows errors of poses {found.ratio:.1f} times as large as "
+            "stated: the other sensors do not. Poses are not the cause but what is next to it, as "
+            "iron that moves or a motor's current (bag.regressors)."
+        )
     what, where = STATED[found.cause]
     what = what.format(sensor=found.sensor)
     of_poses = found.cause is ErrorCause.POSES and found.ratio < 1
@@ -191,11 +197,22 @@ def jump_sentence(jump: OffsetJump) -> str:
 
 
 def _missed(found: Disturbance, result: CalibrationResult) -> float:
-    """Return what a stand-in for numbers may miss at most, in the least sigma of its sensor's H."""
+    """Return what a stand-in for numbers may miss at most, in the least sigma of its sensor's H.
+
+    What it misses is unmodelled: sigmas are without that share here, or it would hide itself.
+    """
     if found.kind is not DisturbanceKind.MOVING_PARTS or found.sensor is None:
         return 0.0
-    size = np.linalg.norm(list(found.sizes.values()))
-    return float(size / result[found.sensor].H_sigma.min())
+    sensor, size = result[found.sensor], np.linalg.norm(list(found.sizes.values()))
+    shares = (e.H for e in sensor.variance_shares if e.cause is ErrorCause.UNMODELLED)
+    modelled = max(1 - sum(shares), LISTED)
+    return float(size / (sensor.H_sigma.min() * np.sqrt(modelled)))
+
+
+def moves(result: CalibrationResult, sensor: str) -> bool:
+    """Return whether H of a sensor was found to follow how the vehicle moves."""
+    own = (each for each in result.disturbances if each.sensor == sensor)
+    return any(each.kind is DisturbanceKind.MOVING_PARTS for each in own)
 
 
 def _share(found: Disturbance, result: CalibrationResult) -> float:

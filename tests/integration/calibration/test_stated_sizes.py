@@ -1,10 +1,14 @@
 """Sigmas of noise and poses that are stated wrongly are noticed, a third and thrice."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.data import Recording
 from l2m_gtsam.qa.verdict.uncertainty import stated_wrongly
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
@@ -70,3 +74,48 @@ def test_noise_stated_too_small_is_no_process_and_counts_as_the_readings_show_it
         # Noise of 1,200 values is known to 2 %; from other weights the solve ends a trifle off.
         assert each.noise == pytest.approx(OPTIONS.noise, rel=0.1)
         assert each.t_sigma == pytest.approx(right.t_sigma, rel=0.1)
+
+
+def with_a_current(recording: Recording) -> Recording:
+    """Return a drive on which a motor next to the first sensor turns the vehicle: 0.7 uT."""
+    (first, *others), way = recording.series, recording.trajectory
+    seconds = 1e-9 * (way.stamp_ns - first.stamp_ns[0])
+    rate = np.gradient(np.unwrap(np.arctan2(way.R[:, 1, 0], way.R[:, 0, 0])), seconds)
+    load = np.abs(np.interp(1e-9 * (first.stamp_ns - first.stamp_ns[0]), seconds, rate))
+    added = 0.7 * (load / load.std())[:, None] * [0.5, -0.7, 0.5]
+    return replace(recording, series=(replace(first, field=first.field + added), *others))
+
+
+def test_poses_are_not_blamed_for_what_one_sensor_shows() -> None:
+    """They are as good as stated: a current next to one of two sensors looks otherwise."""
+    place = hall(Trouble.CLEAN)
+    recording, truth = troubled_drive(OPTIONS, place, Trouble.CLEAN, DRIVE)
+    poses = PoseNoiseOptions(position_m=0.002, rotation_deg=0.05, correlation_s=OPTIONS.pose_s)
+    options = CalibrationOptions(start=starts(truth), solve=OneKeyOptions(pose_noise=poses))
+    result = calibrated(with_a_current(recording), place.field_map, options).result
+    name = recording.series[0].sensor
+    (size,) = (each for each in result.stated if each.cause is ErrorCause.POSES)
+    assert size.is_wrong
+    assert size.ratio > 1
+    assert size.sensor == name
+    assert not stated_wrongly(result.stated, None, None)
+    (reason,) = stated_wrongly(result.stated, name, None)
+    assert "alone shows errors of poses" in reason.text
+
+
+def test_poses_are_blamed_for_what_all_sensors_show() -> None:
+    """Errors of poses that are stated a third of what they are, and the same current."""
+    place, times = hall(Trouble.CLEAN), 1 / 3
+    recording, truth = troubled_drive(OPTIONS, place, Trouble.POSES, DRIVE)
+    poses = PoseNoiseOptions(
+        position_m=times * OPTIONS.pose_m,
+        rotation_deg=times * OPTIONS.pose_deg,
+        correlation_s=OPTIONS.pose_s,
+    )
+    options = CalibrationOptions(start=starts(truth), solve=OneKeyOptions(pose_noise=poses))
+    result = calibrated(with_a_current(recording), place.field_map, options).result
+    (size,) = (each for each in result.stated if each.cause is ErrorCause.POSES)
+    assert size.is_wrong
+    assert size.ratio > 1
+    assert size.sensor is None
+    assert any(each.sensor == recording.series[0].sensor for each in result.disturbances)

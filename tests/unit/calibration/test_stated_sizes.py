@@ -5,11 +5,13 @@ import pytest
 
 from l2m_gtsam.calibration.stated_sizes import (
     NoiseBesidePoses,
+    poses_too_small,
+    shown_by_one,
     size_beside_noise,
     size_of_noise,
     without_prior,
 )
-from l2m_gtsam.records.error_budget import LEAST_GAIN
+from l2m_gtsam.records.error_budget import LEAST_GAIN, ErrorCause, StatedSize
 from l2m_gtsam.solve.linear_algebra import inverse
 
 
@@ -56,3 +58,18 @@ def test_errors_of_poses_that_leave_no_room_for_noise(times: float) -> None:
     assert found.ratio == pytest.approx(1 / times, rel=0.1)
     assert found.is_wrong
     assert size_beside_noise([NoiseBesidePoses(residual, 0.19, of_poses)]) is None
+
+
+@pytest.mark.parametrize(("others", "whose"), [(0.8, "mag"), (1.2, "mag"), (2.0, None)])
+def test_errors_of_poses_are_of_one_sensor_if_the_others_do_not_show_them(
+    others: float, whose: str | None
+) -> None:
+    noise = StatedSize(ErrorCause.NOISE, 1.0, 0.0, "other")
+    stated = (noise, StatedSize(ErrorCause.POSES, 2.4, 100.0))
+    assert poses_too_small(stated)
+    assert not poses_too_small(stated[:1])
+    without = (StatedSize(ErrorCause.POSES, others, 0.0),)
+    found = shown_by_one(stated, without, "mag")
+    assert found[0] is noise
+    assert found[1].sensor == whose
+    assert shown_by_one(stated, (), "mag") == stated  # nothing is known without it

@@ -16,6 +16,7 @@ from l2m_gtsam.records.error_budget import (
     ErrorCause,
     PoseDuration,
     StatedSize,
+    Unmodelled,
     VarianceShare,
 )
 from l2m_gtsam.records.verdict import Level
@@ -67,6 +68,37 @@ def test_what_steers_matters_beside_the_sigma_of_H(size: float, level: Level) ->
     assert reason.level is level
 
 
+def test_what_is_unmodelled_does_not_hide_what_moves() -> None:
+    """Sigmas are larger by what a stand-in misses: it must not matter less for that."""
+    result = read_calibration(FILE)
+    first, *others = result.sensors
+    shares = (
+        VarianceShare(ErrorCause.NOISE, t=0.2, C=0.2, H=0.2),
+        VarianceShare(ErrorCause.UNMODELLED, t=0.8, C=0.8, H=0.8),
+    )
+    turning = {"turning_ut": 0.09 * float(first.H_sigma.min())}
+    found = Disturbance(DisturbanceKind.MOVING_PARTS, turning, gain=50.0, sensor=first.sensor)
+    sensors = (replace(first, variance_shares=shares), *others)
+    result = replace(result, sensors=sensors, disturbances=(found,))
+    (reason,) = disturbance_reasons(result, first.sensor)
+    assert reason.level is Level.WARN
+    explained = replace(first, variance_shares=shares[:1])
+    (reason,) = disturbance_reasons(replace(result, sensors=(explained, *others)), first.sensor)
+    assert reason.level is Level.PASS
+
+
+def test_what_moves_is_named_as_the_cause_of_what_is_unmodelled() -> None:
+    result, metrics = read_calibration(FILE), read_metrics(FILE.with_name("metrics.json"))
+    first, *others = result.sensors
+    scattered = replace(first, unmodelled=Unmodelled(t=4.0, H=4.0))
+    result = replace(result, sensors=(scattered, *others))
+    moving = Disturbance(DisturbanceKind.MOVING_PARTS, {"turning_ut": 1.0}, 50.0, first.sensor)
+    for found, words in (((), "an offset H that drifts"), ((moving,), "The likely cause: its H")):
+        verdict = judge(replace(result, disturbances=found), metrics, QaOptions())
+        (own,) = (each for each in verdict.sensors if each.sensor == first.sensor)
+        assert any(words in each.text for each in own.reasons)
+
+
 @pytest.mark.parametrize(("size", "fails"), [(0.02, False), (1.2, True)])
 def test_a_frame_that_is_bent_by_more_than_half_a_metre_is_of_another_place(
     size: float, fails: bool
@@ -89,3 +121,13 @@ def test_sizes_of_errors_of_poses_are_told_with_the_duration_that_is_assumed() -
     (known,) = stated_wrongly(too_large, None, PoseDuration(1.0, DurationSource.GIVEN))
     assert "assumed" not in known.text
     assert not stated_wrongly(too_large, "mag", None)
+
+
+def test_errors_of_poses_that_one_sensor_shows_are_said_of_it() -> None:
+    """Poses are not to be corrected then."""
+    of_one = [StatedSize(ErrorCause.POSES, ratio=2.4, gain=100.0, sensor="mag")]
+    assert not stated_wrongly(of_one, None, None)
+    (reason,) = stated_wrongly(of_one, "mag", None)
+    assert reason.text.startswith("mag alone shows errors of poses 2.4 times as large as stated")
+    assert "bag.regressors" in reason.text
+    assert "pose_noise" not in reason.text
