@@ -136,9 +136,14 @@ class SensorsOnDrive:
         pairs = zip(self.drives, self.known, strict=True)
         return [usable(drive, self.field_map, known, self.options) for drive, known in pairs]
 
-    def likelihood(self, *here: PoseDisplacement) -> ChangeLikelihood:
-        """Return the likelihood of further displacements, each of poses displaced so far."""
-        each = zip(self.drives, self.known, self.usable(), strict=True)
+    def likelihood(
+        self, counting: Sequence[BoolArray], *here: PoseDisplacement
+    ) -> ChangeLikelihood:
+        """Return the likelihood of further displacements, each of poses displaced so far.
+
+        Of each sensor the readings that are ``counting``, as of ``usable``, are taken.
+        """
+        each = zip(self.drives, self.known, counting, strict=True)
         parts = [drive.at(float(known.vector[15])).select(used) for drive, known, used in each]
         whole = change_likelihood(
             parts,
@@ -214,10 +219,11 @@ def followed(sensors: SensorsOnDrive, start: PoseDisplacement) -> FollowedDispla
     here, last = start, np.full(FREEDOMS, np.inf)
     for _ in range(ROUNDS):
         displaced = sensors.displaced(here)
-        if min(used.sum() for used in displaced.usable()) < sensors.options.min_readings:
+        counting = displaced.usable()
+        if min(used.sum() for used in counting) < sensors.options.min_readings:
             return None
-        likelihood = displaced.likelihood(here).recentred(here.vector)
-        price = np.log(3 * sum(used.sum() for used in displaced.usable()))
+        likelihood = displaced.likelihood(counting, here).recentred(here.vector)
+        price = np.log(3 * sum(used.sum() for used in counting))
         columns = max(COLUMNS, key=lambda at: likelihood.explained(at) - len(at) * price)
         value, covariance = likelihood.estimate(columns)
         if np.max(np.abs(value - last[list(columns)]) / np.sqrt(np.diag(covariance))) < (
@@ -262,8 +268,9 @@ class DisplacementTest:
             for of, at in middles.items()
             if of is Displaced.FRAME or len(sensors.known) > 1
         )
-        count = sum(int(used.sum()) for used in sensors.usable())
-        return cls(starts, sensors.likelihood(*starts), float(np.log(3 * count)))
+        counting = sensors.usable()
+        count = sum(int(used.sum()) for used in counting)
+        return cls(starts, sensors.likelihood(counting, *starts), float(np.log(3 * count)))
 
     def shown(self, chance: float) -> list[PoseDisplacement]:
         """Return those that explain more than chance does, and than they cost."""
