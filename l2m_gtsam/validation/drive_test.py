@@ -22,6 +22,7 @@ from l2m_gtsam.solve.correction import without_moving
 from l2m_gtsam.validation.displacement import SensorsOnDrive
 from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
 from l2m_gtsam.validation.innovation import KnownCalibration
+from l2m_gtsam.validation.map_along_drive import along_drive
 from l2m_gtsam.validation.recheck import SensorDrive, finite, recheck
 
 # Of a map's errors: a test solves several graphs for each sensor.
@@ -37,7 +38,7 @@ class DriveTest:
     recording, readings
         The drive, and what its sensors read with the poses.
     field_map
-        The map, ready to be asked often.
+        The map, ready to be asked often along this drive.
     stuck
         Names of sensors that report one value.
     limits
@@ -110,13 +111,14 @@ def drive_test(
     readings = synchronised.readings
     places = {each.sensor: each.t_lidar_mag for each in known}
     t = np.array([places[name] for name in readings.sensors])
-    extent = extent_of(readings, for_solvers(field_map), t, MOST_WEIGHTS)
+    solver_map = for_solvers(field_map)
+    extent = extent_of(readings, solver_map, t, MOST_WEIGHTS)
     readings = readings.select(extent.counts)
     pairs = zip(readings.sensors, synchronised.counts, strict=True)
     return DriveTest(
         recording=recording,
         readings=readings,
-        field_map=for_solvers(field_map),
+        field_map=along_drive(solver_map),
         stuck=frozenset(readings.sensors[k] for k in stuck_sensors(readings)),
         limits={name: counts.limits for name, counts in pairs},
         options=options,
