@@ -134,7 +134,7 @@ class MapAlongDrive:
         if near:
             return min(near, key=lambda each: sum(each.sizes().values()))
         errors: MapErrors = self._map.errors_over(points)
-        self._errors.append(KnownErrors(cKDTree(points), tiles, errors))
+        self._errors.append(KnownErrors(cKDTree(points, copy_data=True), tiles, errors))
         return errors
 
     def query(self, points: FloatArray, /) -> FieldSample:
