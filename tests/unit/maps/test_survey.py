@@ -39,7 +39,7 @@ def test_a_place_with_two_fields_is_named(by: float) -> None:
 def pole(points: FloatArray) -> FloatArray:
     """A magnetic pole at the origin: 300 uT/m at 0.2 m."""
     away = np.linalg.norm(points, axis=1, keepdims=True)
-    return 1.2 * points / away**3
+    return np.asarray(1.2 * points / away**3)
 
 
 def test_a_steep_field_is_no_two_fields() -> None:
