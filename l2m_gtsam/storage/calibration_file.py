@@ -31,7 +31,7 @@ FIRST_VERSION = {"uncertainty": Uncertainty.INDEPENDENT.value, "doubts": (), "di
 UNCERTAINTY = {
     Uncertainty.FULL: (
         "sigmas include the map's errors, which readings near each other and all sensors share; "
-        "they are right as far as the map explains its own field (`l2m map info`)"
+        "they are right if the map predicts held-out readings of its survey (`l2m map info`)"
     ),
     Uncertainty.INDEPENDENT: (
         "sigmas count the map's errors as independent from reading to reading; where the map is "

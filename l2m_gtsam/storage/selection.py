@@ -125,7 +125,7 @@ def why_poses(
     if options.poses is not None:
         return "named by bag.poses"
     if not others:
-        return "the only topic of its kind"
+        return "the only topic with poses"
     told = ", ".join(f"{c.topic} ({_short(c.msgtype)})" for c in others[:10])
     return f"{_short(chosen[0].msgtype)} is preferred to {told}; `bag.poses` chooses"
 

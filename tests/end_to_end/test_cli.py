@@ -95,7 +95,7 @@ def test_inspect_shows_every_topic(demo: Demo) -> None:
     out = l2m("inspect", demo.drive).out
     assert out.count("magnetic readings") == 2
     assert "nav_msgs/Odometry" in out
-    assert "poses (the only topic of its kind)" in out
+    assert "poses (the only topic with poses)" in out
 
 
 def test_inspect_escapes_what_a_bag_says(tmp_path: Path) -> None:

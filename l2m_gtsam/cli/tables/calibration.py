@@ -207,8 +207,9 @@ def model_table(sensor: str, comparison: ModelComparison) -> Table:
     """
     numbers = f", {', '.join(comparison.regressors)}" if comparison.regressors else ""
     table = new_table(
-        f"Models of {escape(sensor)}{escape(numbers)}: {comparison.readings:,} readings that "
-        f"count as {comparison.independent:,.0f}, {comparison.segments} segments held out in turn",
+        f"Models of {escape(sensor)}{escape(numbers)}: {comparison.readings:,} readings "
+        f"with the information of {comparison.independent:,.0f} independent ones, "
+        f"{comparison.segments} segments held out in turn",
         "model",
         MODEL_HEADINGS,
         f"recommended: {comparison.recommended}; {comparison.reason}",

@@ -299,7 +299,7 @@ def test_inspect_tells_what_would_be_used(tmp_path: Path) -> None:
     assert mag.strength is not None
     assert mag.strength.low == pytest.approx(1e6 * np.linalg.norm(EARTH) * 1.01)
     assert mag.use == "magnetic readings"
-    assert pose.use == "poses (the only topic of its kind)"
+    assert pose.use == "poses (the only topic with poses)"
     assert report.obstacles == ()
 
 

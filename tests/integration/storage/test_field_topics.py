@@ -76,7 +76,7 @@ def test_stamped_vectors_and_a_growing_path(tmp_path: Path) -> None:
     assert report.obstacles == ()
     assert [each.use for each in report.topics] == [
         "magnetic readings",
-        "poses (the only topic of its kind)",
+        "poses (the only topic with poses)",
     ]
 
 

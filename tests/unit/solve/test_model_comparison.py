@@ -230,7 +230,7 @@ def test_the_table_shows_every_model_and_the_recommended_one() -> None:
     console = Console(width=160, record=True, file=StringIO())
     console.print(model_table("front[1]/mag", comparison))
     text = console.export_text()
-    assert "Models of front[1]/mag, amp: 400 readings that count as" in text
+    assert "Models of front[1]/mag, amp: 400 readings with the information of" in text
     for fit in comparison.fits:
         assert with_sigma(fit.held_out_score, fit.score_error) in text
     assert "recommended: full + regressors; full + regressors predicts" in " ".join(text.split())
