@@ -23,6 +23,7 @@ the map as it is, by ``-G d``, since its prior was learnt from the shifted readi
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dpstrf
@@ -128,9 +129,53 @@ class ErrorModes:
         return self.suite.features(self.tiles[tile], points, tile)
 
 
+class MovedTiles:
+    """What errors of the survey's sensors do to the tiles of a map: found once for each tile.
+
+    It takes as long as all else that is asked of the errors over a drive, and does not depend on
+    the drive.
+
+    Parameters
+    ----------
+    learnt
+        Prior and readings of the map.
+    """
+
+    def __init__(self, learnt: Learnt) -> None:
+        self._learnt = learnt
+        self._known: dict[int, FloatArray] = {}
+
+    def __reduce__(self) -> tuple[type["MovedTiles"], tuple[Learnt]]:
+        return MovedTiles, (self._learnt,)
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """Root of the covariance of the 16 errors of each of S sensors, shape (16 S, q)."""
+        suite = self._learnt.suite
+        # Singular, where errors are known or the same.
+        return np.empty((0, 0)) if suite is None else covariance_root(suite.covariance)
+
+    @cached_property
+    def shift(self) -> FloatArray:
+        """How far they move the map as a whole, metres, shape (3, 16 S)."""
+        suite, weight = self._learnt.suite, self._learnt.readings.weight
+        return np.empty((3, 0)) if suite is None else suite.mean_shift(weight)
+
+    def weights(self, index: int, tile: Tile) -> FloatArray:
+        """Return what units of the root's columns do to a tile beside that, shape (m, q)."""
+        found, suite = self._known.get(index), self._learnt.suite
+        if suite is None:
+            return np.empty((len(tile.basis), 0))
+        if found is None:  # two threads at once find the same
+            moved = moved_weights(self._learnt, suite, index, tile, self.shift)
+            found = self._known[index] = np.asarray(moved @ self.root)
+        return found
+
+
 def error_modes(
     learnt: Learnt,
     tiles: Tiles,
+    moved: MovedTiles,
     points: FloatArray,
     options: ErrorOptions,
 ) -> ErrorModes:
@@ -138,8 +183,8 @@ def error_modes(
 
     Parameters
     ----------
-    learnt, tiles
-        Prior and readings of the map, and its solved tiles.
+    learnt, tiles, moved
+        Prior and readings of the map, its solved tiles, and what the survey's sensors do to them.
     points
         Where a drive reads the field, metres, shape (N, 3).
     options
@@ -152,7 +197,7 @@ def error_modes(
         return tile_modes(tiles[index], points[owner == index], options)
 
     found = dict(zip(crossed, in_threads(modes, crossed), strict=True))
-    suite = suite_modes(learnt, found, points, owner, options)
+    suite = suite_modes(learnt, found, moved, points, owner, options)
     return ErrorModes(learnt.tiling.grid, found, joint_covariance(learnt, found), suite)
 
 
@@ -166,6 +211,7 @@ def tile_modes(tile: Tile, points: FloatArray, options: ErrorOptions) -> TileMod
 def suite_modes(
     learnt: Learnt,
     tiles: dict[int, TileModes],
+    moved: MovedTiles,
     points: FloatArray,
     owner: IntArray,
     options: ErrorOptions,
@@ -176,15 +222,12 @@ def suite_modes(
     """
     if learnt.suite is None or not tiles:
         return SuiteModes({}, np.empty((3, 0)), np.empty(0))
-    suite, weight = learnt.suite, learnt.readings.weight
-    root = covariance_root(suite.covariance)  # singular, where errors are known or the same
-    shift = suite.mean_shift(weight)
 
-    def moved(index: int) -> FloatArray:
-        return np.asarray(moved_weights(learnt, suite, index, tiles[index].tile, shift) @ root)
+    def of_tile(index: int) -> FloatArray:
+        return moved.weights(index, tiles[index].tile)
 
-    weights = dict(zip(tiles, in_threads(moved, list(tiles)), strict=True))
-    every = SuiteModes(weights, shift @ root, np.ones(len(root)))
+    weights, root = dict(zip(tiles, in_threads(of_tile, list(tiles)), strict=True)), moved.root
+    every = SuiteModes(weights, moved.shift @ root, np.ones(len(root)))
     gram = np.zeros((len(root), len(root)))
     for index, each in tiles.items():
         rows = np.flatnonzero(owner == index)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
-from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes, tile_modes
+from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, MovedTiles, error_modes, tile_modes
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.pose_sizes import with_pose_errors
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
@@ -160,7 +160,12 @@ class HarmonicMap:
 
     def errors_over(self, points: FloatArray, /) -> ErrorModes:
         """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
-        return error_modes(self.learnt, self.tiles, checked_points(points), self.options.errors)
+        places = checked_points(points)
+        return error_modes(self.learnt, self.tiles, self._moved, places, self.options.errors)
+
+    @cached_property
+    def _moved(self) -> MovedTiles:
+        return MovedTiles(self.learnt)
 
     def tile_of(self, points: FloatArray, /) -> IntArray:
         """Return which tile answers at each place, shape (N,)."""
@@ -345,7 +350,7 @@ class HarmonicMap:
         if not count:
             return np.empty((0, 3, 0, 3))
         every = ErrorOptions(places=max(count, 10), rest=EXACT)
-        errors = error_modes(self.learnt, self.tiles, points, every)
+        errors = error_modes(self.learnt, self.tiles, self._moved, points, every)
         A = np.zeros((3 * count, len(errors.covariance)))
         owner, start = errors.owner(points), 0
         for tile, size in errors.sizes().items():

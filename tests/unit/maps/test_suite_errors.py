@@ -1,6 +1,8 @@
 """Errors of the sensors that surveyed, carried by the map that was made of their readings."""
 
+import pickle
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from hypothesis import strategies as st
 from l2m_gtsam.data import FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import map_from_state
+from l2m_gtsam.maps.harmonic import error_modes
+from l2m_gtsam.maps.harmonic.error_modes import moved_weights
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.suite_found import shown
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
@@ -107,6 +111,27 @@ def test_the_map_moves_as_its_errors_say(uncertain: HarmonicMap) -> None:
     np.testing.assert_allclose(seen @ unitary, changed, atol=1e-6 * np.abs(changed).max())
     # The numbers that make this change are as likely as the errors they come from.
     assert unitary @ unitary == pytest.approx(unit @ unit, rel=1e-5)
+
+
+def test_what_they_do_to_a_tile_is_found_once(
+    uncertain: HarmonicMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever drive asks: it is the map's."""
+    fresh = HarmonicMap.condition(uncertain.learnt, uncertain.options)
+    asked, at = list[int](), within_survey()
+
+    def counted(*given: Any) -> FloatArray:
+        asked.append(given[2])
+        return moved_weights(*given)
+
+    monkeypatch.setattr(error_modes, "moved_weights", counted)
+    first, again = fresh.errors_over(at), fresh.errors_over(at)
+    assert sorted(asked) == sorted(first.sizes())
+    there = pickle.loads(pickle.dumps(fresh)).errors_over(at)  # noqa: S301 - our own
+    for tile in first.sizes():
+        expected = first.common_features(at, tile)
+        np.testing.assert_array_equal(again.common_features(at, tile), expected)
+        np.testing.assert_array_equal(there.common_features(at, tile), expected)
 
 
 def test_a_shift_of_all_readings_moves_the_map_as_it_is() -> None:
