@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -117,7 +117,8 @@ def _computed(
     for task, outcome in computed(WORK, missing, cluster):
         outcomes[task.drive.folder] = outcome
         count(len(outcomes), len(tasks))
-    rows = [row for task in tasks for row in _rows(task.drive, outcomes[task.drive.folder])]
+    once = counted_once({task.drive.folder: outcomes[task.drive.folder] for task in tasks})
+    rows = [row for task in tasks for row in _rows(task.drive, once[task.drive.folder])]
     return _publish(out, rows, options, Fleet((), len(tasks), len(missing), ()))
 
 
@@ -196,6 +197,27 @@ def _there(task: FleetTask) -> DriveOutcome | None:
         return found if source_file(task.drive.bag).sha256 == found.key.bag else None
     except L2MError:
         return None
+
+
+def counted_once(outcomes: Mapping[str, DriveOutcome]) -> dict[str, DriveOutcome]:
+    """Return outcomes in which a recording that has several names counts under the first.
+
+    Twice it would make a vehicle seem to repeat.
+
+    Parameters
+    ----------
+    outcomes
+        Of drives by their folders.
+    """
+    first: dict[tuple[str, str, str], str] = {}
+    once = dict(outcomes)
+    for folder, outcome in outcomes.items():
+        same = outcome.key.bag, outcome.key.map, outcome.key.config
+        if outcome.error or first.setdefault(same, folder) == folder:
+            continue
+        error = f"it is the same recording as {first[same]}, which counts; leave one of them out"
+        once[folder] = replace(outcome, sensors=(), error=error)
+    return once
 
 
 def _rows(drive: FleetDrive, outcome: DriveOutcome) -> list[FleetRow]:
