@@ -8,22 +8,26 @@ The drive without it decides: there the others are as they were calibrated.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from l2m_gtsam.data import Recording
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import LocalisationResult
+from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.pose_graph import stated_information_root
 from l2m_gtsam.solve.chi_square import exceeded_by
 
 PARAMETERS = 15
 # Of a sound sensor's change; that of sensors whose sigmas are somewhat small is beyond it, too.
 CHANCE = 1e-9
+LARGEST = float(exceeded_by(CHANCE, PARAMETERS))
 PLAINER = 4.0  # times, beyond all other sensors, and beyond what is left without it
 MOST = 3  # sensors that are tried
 
 
 @dataclass(frozen=True)
-class WithoutSensor:
-    """Which sensor to leave out, and by how much its calibration changed.
+class MovedSensor:
+    """Which sensor is no longer as calibrated, and by how much its calibration changed.
 
     Attributes
     ----------
@@ -36,8 +40,17 @@ class WithoutSensor:
     sensor: str
     change: float
 
+    def warning(self) -> str:
+        """Return that it is contradicted, as an event."""
+        return (
+            f"{self.sensor} contradicts its calibration (chi-square {self.change:.0f} of "
+            f"{PARAMETERS}): it was moved, its iron changed, or the place is another one; poses "
+            "may be off by far more than their sigmas. Calibrate it anew, or leave it out "
+            "(`bag.fields`)"
+        )
+
     def note(self) -> str:
-        """Return it as a note."""
+        """Return that it is left out, as a note."""
         return (
             f"{self.sensor} is left out: with it poses would contradict its calibration "
             f"(chi-square {self.change:.0f} of {PARAMETERS}), without it those of the other "
@@ -66,7 +79,7 @@ def calibration_change(before: SensorCalibration, after: SensorCalibration) -> f
 
 def sensor_to_leave_out(
     changes: dict[str, float], without: Callable[[str], dict[str, float]]
-) -> WithoutSensor | None:
+) -> MovedSensor | None:
     """Return the sensor without which those that are left hold.
 
     None where no calibration changed by more than chance, or several sensors alike.
@@ -78,8 +91,8 @@ def sensor_to_leave_out(
     without
         Gives those of the others once a sensor is left out; empty where they determine nothing.
     """
-    most, chance = max(changes.values(), default=0.0), float(exceeded_by(CHANCE, PARAMETERS))
-    if len(changes) < 2 or most < chance:
+    most = max(changes.values(), default=0.0)
+    if len(changes) < 2 or most < LARGEST:
         return None
     suspects = sorted(
         (name for name, change in changes.items() if PLAINER * change > most),
@@ -91,13 +104,43 @@ def sensor_to_leave_out(
     for name in suspects:
         left[name] = max(without(name).values(), default=most)
         # Of three and more those that are left contradict each other if the wrong one is out.
-        if len(changes) > 2 and left[name] < chance:
-            return WithoutSensor(name, changes[name])
+        if len(changes) > 2 and left[name] < LARGEST:
+            return MovedSensor(name, changes[name])
     name = min(left, key=lambda each: left[each])
     others = (value for each, value in left.items() if each != name)
     if PLAINER * left[name] > min([most, *others]):
         return None
-    return WithoutSensor(name, changes[name])
+    return MovedSensor(name, changes[name])
+
+
+class CalibrationWatch:
+    """Which calibrations a drive contradicts so far, as it is driven.
+
+    Nothing is left out: whether the others hold without a sensor is known off line only.
+
+    Parameters
+    ----------
+    given
+        Sensors as they were calibrated.
+    """
+
+    def __init__(self, given: KnownSensors) -> None:
+        self._given = given
+        self._roots = np.stack([stated_information_root(each) for each in given.covariance])
+        self._told: set[str] = set()
+
+    def refuted(self, refined: KnownSensors) -> list[MovedSensor]:
+        """Return the sensors that are contradicted now and were not before."""
+        off = refined.vectors() - self._given.vectors()
+        white = np.einsum("sij,sj->si", self._roots, off)
+        changes = zip(self._given.names, np.einsum("si,si->s", white, white), strict=True)
+        found = [
+            MovedSensor(name, float(change))
+            for name, change in changes
+            if change > LARGEST and name not in self._told
+        ]
+        self._told |= {each.sensor for each in found}
+        return found
 
 
 def without_series(recording: Recording, sensors: Iterable[str]) -> Recording:

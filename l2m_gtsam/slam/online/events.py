@@ -25,6 +25,7 @@ class EventKind(StrEnum):
     START_OPEN = "start_open"
     CORRECTION_REFUSED = "correction_refused"
     ONE_SENSOR = "one_sensor"
+    CALIBRATION_REFUTED = "calibration_refuted"
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose, as_transform
 from l2m_gtsam.slam.held_calibration import with_calibration_use
 from l2m_gtsam.slam.localisation import known_sensors, left_out, start_pose, why_unusable
+from l2m_gtsam.slam.moved_sensors import CalibrationWatch
 from l2m_gtsam.slam.online.arguments import refuse_unusable
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.branches import Branch, BranchedFollower, GapDoubt
@@ -158,6 +159,7 @@ class OnlineSlam:
         self.sensors = self.given_sensors = known_sensors(usable)
         self.options = with_calibration_use(options, self.sensors, one_field=self._one_field)
         self._map = None if field_map is None else for_solvers(field_map)
+        self._watch = CalibrationWatch(self.sensors)
         self.matcher = matcher
         axes = None if field_map is None else np.array([1.0, 1.0, options.drift.of_height])
         # The axes of the one field are the first key pose's, of which none need be vertical.
@@ -322,6 +324,8 @@ class OnlineSlam:
         if key_pose.is_over_gap:
             self._counts.clear()
         self._count(best.seen - seen, best.used - used)
+        for each in self._watch.refuted(belief.known_sensors):
+            self._report(EventKind.CALIBRATION_REFUTED, each.warning())
         wrong = self._wrong_over_gaps(estimator)
         if any(each.off_m > FAR_M for each in wrong) and isinstance(self._map, Surveyed):
             self._lose(key_pose)

@@ -8,7 +8,11 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import Distortion, KnownSensor
 from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.localisation import localise
+from l2m_gtsam.slam.online.events import EventKind
+from l2m_gtsam.slam.online.replay import messages
+from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
+from tests.drives.online import driven
 from tests.drives.slam import calibrated, rounds, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -43,6 +47,17 @@ def test_it_is_left_out_and_poses_are_those_of_the_others() -> None:
     assert found.calibration[second.sensor].message == known[second.sensor].message
 
 
+def test_on_line_it_is_reported_first() -> None:
+    first, second, third = sensors = random_sensors(21, 3)
+    known = calibrated(sensors, sigma=SIGMA, rng=np.random.default_rng(2))
+    moved = (first, knocked(second), third)
+    drive = slam_drive(WORLD, moved, rounds(12), np.random.default_rng(21))
+    run = driven(OnlineSlam(known, OPTIONS, WORLD), messages(drive.recording))
+    told = run.texts(EventKind.CALIBRATION_REFUTED)
+    assert f"{second.sensor} contradicts its calibration" in told[0]
+    assert len(told) <= 3
+
+
 def test_sensors_that_hold_all_count() -> None:
     sensors = random_sensors(21, 3)
     known = calibrated(sensors, sigma=SIGMA, rng=np.random.default_rng(2))
@@ -50,3 +65,5 @@ def test_sensors_that_hold_all_count() -> None:
     found = localise(drive.recording, WORLD, known, OPTIONS, silent).result
     assert len(found.sensors) == 3
     assert not any("left out" in each for each in found.notes)
+    run = driven(OnlineSlam(known, OPTIONS, WORLD), messages(drive.recording))
+    assert EventKind.CALIBRATION_REFUTED not in run.kinds

@@ -1,8 +1,13 @@
 """Which of several sensors is no longer as calibrated."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
-from l2m_gtsam.slam.moved_sensors import sensor_to_leave_out
+import numpy as np
+import pytest
+
+from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.moved_sensors import CalibrationWatch, sensor_to_leave_out
 
 MANY = {"a": 40.0, "b": 3000.0, "c": 900.0}
 
@@ -67,3 +72,25 @@ def test_of_two_each_alone_may_hold_and_neither_is_blamed() -> None:
 def test_where_nothing_is_refined_without_it_nothing_is_left_out() -> None:
     _, without = answers({"b": {}, "c": {}})
     assert sensor_to_leave_out(MANY, without) is None
+
+
+def test_on_line_each_sensor_is_told_once() -> None:
+    given = KnownSensors(
+        ("a", "b"),
+        np.zeros((2, 3)),
+        np.zeros((2, 12)),
+        np.zeros(2),
+        np.full(2, 0.1),
+        np.stack([0.01 * np.eye(15)] * 2),
+    )
+    watch = CalibrationWatch(given)
+    assert watch.refuted(given) == []
+    # Nine sigmas of 0.1: chi-square 81 of 15, beyond 74.
+    moved = replace(given, t=np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]]))
+    (found,) = watch.refuted(moved)
+    assert found.sensor == "b"
+    assert found.change == pytest.approx(81.0)
+    assert "b contradicts its calibration (chi-square 81 of 15)" in found.warning()
+    assert watch.refuted(moved) == []
+    both = replace(moved, distortion=np.full((2, 12), 0.3))
+    assert [each.sensor for each in watch.refuted(both)] == ["a"]
