@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import FloatArray, Readings, Recording, RigidTransform, Trajectory
-from l2m_gtsam.errors import CalibrationError, ConfigError, SyncError
+from l2m_gtsam.errors import CalibrationError, ConfigError, L2MError, SyncError
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.maps.field_map import check_frame
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -108,7 +108,10 @@ def localise(
 
     def without(sensor: str) -> dict[str, float]:
         rest = without_series(recording, [sensor])
-        tried[sensor] = localised(rest, field_map, calibration, options, progress, evidence)
+        try:
+            tried[sensor] = localised(rest, field_map, calibration, options, progress, evidence)
+        except (L2MError, np.linalg.LinAlgError):  # the others do not place the vehicle
+            return {}
         return calibration_changes(calibration, tried[sensor].result)
 
     out = sensor_to_leave_out(calibration_changes(calibration, found.result), without)

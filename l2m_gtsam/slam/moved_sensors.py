@@ -98,7 +98,7 @@ def sensor_to_leave_out(
         (name for name, change in changes.items() if PLAINER * change > most),
         key=lambda name: -changes[name],
     )
-    if len(suspects) > MOST:
+    if len(suspects) > MOST or len(suspects) == len(changes) > 2:  # it is the map, or the start
         return None
     left = dict[str, float]()
     for name in suspects:
