@@ -57,7 +57,8 @@ def gauss_newton(
     params.setLinearSolverType(LinearSolver.CHOLESKY.value)
     engine = gtsam.GaussNewtonOptimizer(graph, start, params)
     for _ in range(max_iterations):
-        before, error = engine.values(), engine.error()
+        # A copy: the engine's own values are gone with the next step.
+        before, error = gtsam.Values(engine.values()), engine.error()
         step = unless_indeterminate(engine.iterate)
         if step is None or not engine.error() <= most_after_step(error):
             left = max_iterations - engine.iterations()

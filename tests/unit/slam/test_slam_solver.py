@@ -6,10 +6,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from l2m_gtsam.calibration.optimise import TOLERANCE
+from l2m_gtsam.calibration.optimise import TOLERANCE, Ending
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.solver import (
     colamd_ordering,
+    gauss_newton,
     levenberg_marquardt,
     stepwise_levenberg_marquardt,
 )
@@ -29,6 +30,32 @@ def test_where_cholesky_is_refused_descents_go_on_by_qr(
     assert graph.error(found) < 1e-3
     found, _ = in_steps(graph, begin, 50)
     assert graph.error(found) < 1e-3
+
+
+@pytest.mark.parametrize("begin_at", [0.5, 3.0])
+def test_where_a_whole_step_overshoots_a_damped_one_is_made(begin_at: float) -> None:
+    """From 3 on the tangent of an arc tangent leads to -9.5; from half it leads home.
+
+    Factors' values of the step before are still there: the optimiser forgets its own.
+    """
+    keys = [gtsam.symbol("x", k) for k in range(100)]
+    graph, begin = gtsam.NonlinearFactorGraph(), gtsam.Values()
+
+    def residual(
+        this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        at = values.atVector(this.keys()[0])
+        if jacobians is not None:
+            jacobians[0] = np.array([1 / (1 + at**2)])
+        return np.asarray(np.arctan(at))
+
+    for key in keys:
+        graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [key], residual))
+        begin.insert(key, np.array([begin_at]))
+    found = gauss_newton(graph, begin, colamd_ordering(graph), 50)
+    assert found.ending is Ending.TOLERANCE
+    assert graph.error(found.values) < 1e-4
+    assert begin.atVector(keys[0])[0] == begin_at
 
 
 @pytest.mark.parametrize("in_pieces", [False, True])
