@@ -19,9 +19,10 @@ from l2m_gtsam.storage.field_types import (
     named_source,
 )
 from l2m_gtsam.storage.log import Log
-from l2m_gtsam.storage.messages import ALL_POSE_TYPES, PATH_TYPE, TF_TYPES
+from l2m_gtsam.storage.messages import ALL_POSE_TYPES, TF_TYPES
 
 ROS_POSE_TYPES = tuple(each for each in ALL_POSE_TYPES if not each.startswith("csv/"))
+WITH_COVARIANCE = [each for each in ALL_POSE_TYPES if "Covariance" in each or "Odometry" in each]
 GLOB = re.compile(r"[*?\[]")
 
 
@@ -108,15 +109,13 @@ def other_poses(bag: Log, chosen: Sequence[Connection]) -> list[Connection]:
     return sorted(found.values(), key=lambda c: (ALL_POSE_TYPES.index(c.msgtype), c.topic))
 
 
-def why_poses(
-    chosen: Sequence[Connection], others: Sequence[Connection], options: BagOptions
-) -> str:
+def why_poses(others: Sequence[Connection], options: BagOptions) -> str:
     """Return in a clause why the poses are those of a topic.
 
     Parameters
     ----------
-    chosen, others
-        Where they come from, and which other topics have some.
+    others
+        Which other topics have some.
     options
         What was asked for.
     """
@@ -126,26 +125,26 @@ def why_poses(
         return "named by bag.poses"
     if not others:
         return "the only topic with poses"
-    told = ", ".join(f"{c.topic} ({_short(c.msgtype)})" for c in others[:10])
-    return f"{_short(chosen[0].msgtype)} is preferred to {told}; `bag.poses` chooses"
+    told = ", ".join(c.topic for c in others[:10])
+    return f"preferred to {told}; `bag.poses` chooses"
 
 
 def pose_notes(bag: Log, chosen: Sequence[Connection], options: BagOptions) -> tuple[str, ...]:
     """Return a sentence on which poses are used, where other topics have some and none is named.
 
-    A path beside other poses is no other source: most repeat them, or are plans.
+    Not of others that cannot have a covariance: a path repeats poses or is a plan, and a pose
+    without one is, beside odometry, most often the truth.
 
     Parameters
     ----------
     bag, chosen, options
         The log, where the poses come from, and what was asked for.
     """
-    others = [c for c in other_poses(bag, chosen) if c.msgtype != PATH_TYPE]
+    others = [c for c in other_poses(bag, chosen) if c.msgtype in WITH_COVARIANCE]
     named = options.tf is not None or options.poses is not None
     if named or not chosen or not others:
         return ()
-    why = why_poses(chosen, others, options)
-    return (f"{bag.path}: poses are those of {chosen[0].topic}: {why}",)
+    return (f"{bag.path}: poses are those of {chosen[0].topic}, {why_poses(others, options)}",)
 
 
 def _short(msgtype: str) -> str:

@@ -144,12 +144,12 @@ def test_poses_of_another_topic_are_named(tmp_path: Path, kind: str) -> None:
     other = [e for e in poses(kind, ALL, stamped=True) if e.topic == "/pose"]
     both = [*odometry, *(replace(each, topic="/lio") for each in other)]
     path = write(tmp_path, kind, sorted(both, key=lambda e: e.record_ns))
-    why = "Odometry is preferred to /lio (PoseWithCovarianceStamped); `bag.poses` chooses"
+    why = "preferred to /lio; `bag.poses` chooses"
     lio, _, used = inspect_bag(path, BagOptions()).topics
     assert used.use.startswith(f"poses ({why}), their covariance is unknown")
     assert lio.use.startswith("poses, with covariance, not used")
     found = read_recording(path, BagOptions())
-    assert found.notes == (f"{path}: poses are those of /pose: {why}",)
+    assert found.notes == (f"{path}: poses are those of /pose, {why}",)
     assert found.trajectory.covariance is None
     chosen = BagOptions(poses="/lio")
     assert read_recording(path, chosen).notes == ()

@@ -311,7 +311,7 @@ def test_a_path_beside_poses_is_no_note(tmp_path: Path) -> None:
     bag = write(tmp_path, "mcap", [*content, Entry("/path", "nav_msgs/Path", START, path)])
     assert not any("are those of" in each for each in read_recording(bag, BagOptions()).notes)
     (pose,) = (t for t in inspect_bag(bag, BagOptions()).topics if t.topic == "/pose")
-    assert pose.use == "poses (PoseStamped is preferred to /path (Path); `bag.poses` chooses)"
+    assert pose.use == "poses (preferred to /path; `bag.poses` chooses)"
 
 
 def test_inspect_reports_instead_of_refusing(tmp_path: Path) -> None:
