@@ -144,13 +144,7 @@ def solve_uncertain(
     if short:
         left = found.estimate.noise / near.noise
         stated = beside_processes(stated, view.readings.sensors, left)
-    suspect = moved_most(shown.found)
-    if suspect is not None and poses_too_small(stated) and len(view.sensors) > 1:
-        others = [s for s in view.sensors if s != suspect]
-        part = view.select(view.readings.sensor != suspect, others)
-        without = step_to_optimum(part, field_map, errors, near, tests, options).optimum
-        name = view.readings.sensors[suspect]
-        stated = shown_by_one(stated, without.stated(None), name)
+    stated = of_its_sensor(stated, shown.found, view, field_map, errors, near, tests, options)
     optimum = found.optimum
     solved, size = optimum.by_cause(optimum.solutions()), None
     if known is not None and options.warp_m > 0 and found.drive.budget.warp is None:
@@ -192,6 +186,36 @@ def check_by_parts(
         found.unsettled,
         by_parts=found.optimum.by_parts(),
     )
+
+
+def of_its_sensor(
+    stated: tuple[StatedSize, ...],
+    found: Sequence[FoundProcess],
+    view: View,
+    field_map: QueryableMap,
+    errors: UncertainMap,
+    near: Estimate,
+    tests: Mapping[int, Determinacy],
+    options: OneKeyOptions,
+) -> tuple[StatedSize, ...]:
+    """Return sizes where errors of poses are said of the sensor that alone shows them, if one does.
+
+    A step without the sensor whose H changes most clearly tells.
+
+    Parameters
+    ----------
+    stated, found
+        Sizes that all sensors show, and the processes.
+    view, field_map, errors, near, tests, options
+        As of ``solve_uncertain``.
+    """
+    suspect = moved_most(found)
+    if suspect is None or not poses_too_small(stated) or len(view.sensors) < 2:
+        return stated
+    others = [sensor for sensor in view.sensors if sensor != suspect]
+    part = view.select(view.readings.sensor != suspect, others)
+    without = step_to_optimum(part, field_map, errors, near, tests, options).optimum
+    return shown_by_one(stated, without.stated(None), view.readings.sensors[suspect])
 
 
 def moved_most(found: Sequence[FoundProcess]) -> int | None:

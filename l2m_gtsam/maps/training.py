@@ -24,7 +24,9 @@ NARROW = 0.1  # metres; a drive this close to one line does not determine the fi
 SAME_PLACE = 0.05  # metres; edge of a cube in which all readings should agree
 # In microtesla, beside what the field changes by from reading to reading there.
 DISAGREE = 10.0
-STEEPER = 2.0  # how many times as steep as along the path a field may be across it
+# How many times as steep as along the path a field may be across it: beside a pole it falls
+# outwards by twice what it rises sideways, as its divergence is zero.
+STEEPER = 2.0
 # Twice the strongest field of the Earth, in microtesla.
 STRONG = 130.0
 FEW = 0.01  # of the readings; single spikes are no reason to doubt a survey
