@@ -1,16 +1,16 @@
-r"""Steps of an odometry that drifts steadily along fixed axes: by a current, wind, or a slope.
+r"""Steps of an odometry that drifts steadily: by a current, wind or a slope, or by turning.
 
 What is added to each step is ``W_k v`` along the axes of the frame of the poses, with v common to
-all steps: its first three components come with time, the others with the distance. With the turn R
-and the way p of a step along the axes of the vehicle
+all steps: the turn ``u_k``, about one axis as by a gyroscope's bias or by unequal wheels, and the
+way ``s_k``. With the turn R and the way p of a step along the axes of the vehicle
 
 .. math::
-    e = Log(Z^{-1} X_k^{-1} X_{k+1}), \quad Z = (R, p - R_k^T W_k v)
+    e = Log(Z^{-1} X_k^{-1} X_{k+1}), \quad Z = (Exp(-R_k^T u_k) R, p - R_k^T s_k)
 
 and with the turn R and the way d along the axes of the frame of the poses
 
 .. math::
-    e = [Log(R_k^T R^T R_{k+1}), R_{k+1}^T (p_{k+1} - p_k - d + W_k v)]
+    e = [Log(R_k^T R^T Exp(u_k) R_{k+1}), R_{k+1}^T (p_{k+1} - p_k - d + s_k)]
 """
 
 import gtsam
@@ -37,22 +37,30 @@ def drifting_step(key_pose: int, step: gtsam.Pose3, weights: FloatArray) -> Resi
         The next key pose in its frame, with the drift.
     weights
         Metres that one unit of the drift with time, and of that with distance, adds to the step,
-        shape (2,); or along each axis of the frame of the poses, shape (2, 3).
+        shape (2,); or along each axis of the frame of the poses, shape (2, 3). Or what one unit of
+        each of n components adds along these axes, a turn about one axis (rad) before the way (m),
+        shape (6, n).
     """
-    R, W = step.rotation(), drift_weights(weights)
+    W = drift_weights(weights)
 
     def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         before, after = values.atPose3(X(key_pose)), values.atPose3(X(key_pose + 1))
         back = before.rotation().matrix().T
-        drift = back @ W @ values.atVector(V())
-        off = gtsam.Pose3(R, step.translation() - drift).between(before.between(after))
+        own = np.vstack([back @ W[:3], back @ W[3:]])
+        turn, drift = np.split(own @ values.atVector(V()), 2)
+        turned = gtsam.Rot3.Expmap(-turn)
+        without = gtsam.Pose3(turned.compose(step.rotation()), step.translation() - drift)
+        off = without.between(before.between(after))
         if jacobians is not None:
             by_off = gtsam.Pose3.LogmapDerivative(off)
-            # The drift as a right perturbation of the step.
-            by_drift = (-by_off @ off.inverse().AdjointMap())[:, 3:] @ -R.matrix().T
             by_before = -by_off @ before.between(after).inverse().AdjointMap()
-            by_before[:, :3] += by_drift @ skew(drift[None])[0]
-            jacobians[0], jacobians[1], jacobians[2] = by_before, by_off, by_drift @ back @ W
+            # Turn and drift as a right perturbation of the step: turns about one axis add up, and
+            # both keep their axes in the frame where the pose before turns.
+            by_own = -by_off @ off.inverse().AdjointMap()
+            by_own = by_own @ np.kron(-np.eye(2), without.rotation().matrix().T)
+            by_before[:, :3] += by_own[:, :3] @ (np.eye(3) - turned.matrix())
+            by_before[:, :3] += by_own[:, 3:] @ skew(drift[None])[0]
+            jacobians[0], jacobians[1], jacobians[2] = by_before, by_off, by_own @ own
         return np.asarray(gtsam.Pose3.Logmap(off))
 
     return Residual([X(key_pose), X(key_pose + 1), V()], 6, error)
@@ -79,21 +87,27 @@ def drifting_fixed_axes_step(
 
     def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         poses = [values.atPose3(X(key_pose + end)) for end in (0, 1)]
+        turned, drift = np.split(W @ values.atVector(V()), 2)
+        without = gtsam.Rot3.Expmap(-turned).compose(turn)
+        found = fixed_axes_residual(poses, without, way - drift, jacobians)
         if jacobians is not None:
-            back = poses[1].rotation().matrix().T
-            jacobians[2] = np.vstack([np.zeros((3, 6)), back @ W])
-        return fixed_axes_residual(poses, turn, way - W @ values.atVector(V()), jacobians)
+            back, by_turn = poses[1].rotation().matrix().T, jacobians[1][:3, :3]
+            jacobians[2] = np.vstack([by_turn @ back @ W[:3], back @ W[3:]])
+        return found
 
     return Residual([X(key_pose), X(key_pose + 1), V()], 6, error)
 
 
 def drift_weights(weights: FloatArray) -> FloatArray:
-    """Return W, what a unit of each component of the drift adds to a step in m, shape (3, 6).
+    """Return W, what a unit of each component of the drift adds to a step, shape (6, n).
 
     Parameters
     ----------
     weights
         As of ``drifting_step``.
     """
+    if len(weights) == 6:
+        return np.asarray(weights, dtype=np.float64)
     along_axes = np.broadcast_to(np.reshape(weights, (2, -1)), (2, 3))
-    return np.hstack([np.diag(each) for each in along_axes])
+    ways = np.hstack([np.diag(each) for each in along_axes])
+    return np.vstack([np.zeros_like(ways), ways])

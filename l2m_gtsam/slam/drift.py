@@ -6,6 +6,8 @@ from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.geometry import isotropic_covariance, turn_angle
 from l2m_gtsam.slam.options import DriftOptions
 
+DRIFT = 8
+"""Components of a steady drift: along three axes with time, with distance; turning with both."""
 PLANAR = 1e-6  # metres and radians; a lidar or a gyroscope leaves a plane by more
 PLANE = (
     "Odometry never leaves a plane: if the floor is as even and the vehicle does not rock, "
@@ -42,16 +44,21 @@ def steady_share(options: DriftOptions, *, is_stated: bool) -> FloatArray:
     return share * np.array([1.0, 1.0, options.of_height])
 
 
+def steady_turn(options: DriftOptions) -> FloatArray:
+    """Return the standard deviation of a steady turning in radians per metre, shape (1,)."""
+    return np.deg2rad([options.steady_turn_deg_per_m])
+
+
 def steady_weights(seconds: FloatArray, p: FloatArray, share: FloatArray) -> FloatArray:
-    """Return what a steady drift by a share of the distance adds to N steps, m, shape (N, 2, 3).
+    """Return what a steady drift by a share of the distance adds to N steps, shape (N, 2, d).
 
     Parameters
     ----------
     seconds, p
         Times and steps, shapes (N,) and (N, 3), metres.
     share
-        Standard deviation along each axis after the whole drive, half of its variance with time,
-        shape (3,).
+        Standard deviation of each of d components per metre of the whole drive, half of its
+        variance with time, shape (d,).
     """
     length = np.linalg.norm(p, axis=1)
     speed = length.sum() / seconds.sum() if len(seconds) else 0.0

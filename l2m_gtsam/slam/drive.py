@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from l2m_factors import Calibrations, KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform
@@ -173,6 +174,11 @@ class Drive:
             covariance[each.step] = each.covariance
         return replace(self, steps=replace(self.steps, R=R, p=p, covariance=covariance))
 
+    @property
+    def drifts(self) -> FloatArray | None:
+        """What a unit of the steady drift adds to each step; see ``OdometrySteps.drifts``."""
+        return self.steps.drifts(self.start.T_map_lidar.R @ self.steps.up_start)
+
     def as_walk(self, over_m: float) -> "Drive":
         """Return the drive for solvers of poses alone; see ``OdometrySteps``."""
         return replace(self, steps=self.steps.as_walk(over_m))
@@ -187,18 +193,27 @@ class Drive:
         Parameters
         ----------
         drift
-            In its standard deviations, along the axes of the poses, shape (6,); None for none.
+            In its standard deviations, along the axes of the poses, shape (8,); None for none.
         poses
             K key poses.
         """
-        if drift is None or self.steps.steady is None:
+        drifts = self.drifts
+        if drift is None or drifts is None:
             return self
-        added = np.einsum("nij,ij->nj", self.steps.steady, drift.reshape(2, 3))
+        turned, added = np.hsplit(drifts @ drift, 2)
         R, _ = stacked(poses[:-1])
         own, fixed = np.einsum("nji,nj->ni", R, added), self.steps.fixed_axes
         if fixed is not None:
             fixed = fixed - added @ self.start.T_map_lidar.R
-        steps = replace(self.steps, p=self.steps.p - own, fixed_axes=fixed, steady=None)
+        back = Rotation.from_rotvec(-np.einsum("nji,nj->ni", R, turned)).as_matrix()
+        steps = replace(
+            self.steps,
+            R=back @ self.steps.R,
+            p=self.steps.p - own,
+            fixed_axes=fixed,
+            steady=None,
+            turning=None,
+        )
         return replace(self, steps=steps)
 
 

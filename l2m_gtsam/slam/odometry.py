@@ -17,7 +17,14 @@ from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.recording.odometry_jumps import Jump, RepairedOdometry
 from l2m_gtsam.recording.sync import has_pose, interpolated, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
-from l2m_gtsam.slam.drift import drift_covariance, steady_share, steady_weights, stretched
+from l2m_gtsam.slam.drift import (
+    DRIFT,
+    drift_covariance,
+    steady_share,
+    steady_turn,
+    steady_weights,
+    stretched,
+)
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions, SlamOptions, StepAxes, Usage
 
 # Rounding and interpolation may make eigenvalues of a step's covariance slightly negative.
@@ -63,6 +70,9 @@ class OdometrySteps:
         What one standard deviation of a steady drift adds to each step along the axes of the frame
         of the poses, metres, shape (K - 1, 2, 3): of the drift that comes with time, and of that
         with distance. None for none.
+    turning
+        What one standard deviation of a steady turning adds to each step about the third axis of
+        the frame of the poses, rad, shape (K - 1, 2), likewise. None for none.
     up_start
         The third axis of the frame of the poses, in the frame of the first key pose, shape (3,).
     """
@@ -74,6 +84,7 @@ class OdometrySteps:
     scale: float = 0.0
     fixed_axes: FloatArray | None = None
     steady: FloatArray | None = None
+    turning: FloatArray | None = None
     up_start: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     def __len__(self) -> int:
@@ -96,6 +107,31 @@ class OdometrySteps:
             axes.append(turn.T @ axes[-1])
         return np.reshape(axes[1:], (-1, 3))
 
+    def drifts(self, up: FloatArray) -> FloatArray | None:
+        """Return what a unit of each component of the steady drift adds to each step.
+
+        Parameters
+        ----------
+        up
+            The third axis of the frame of the poses, along the axes in which the result is: those
+            of that frame, or, if a drift is as large along all, any.
+
+        Returns
+        -------
+        FloatArray | None
+            Rotation about that axis (rad) before translation (m), shape (K - 1, 6, 8); None where
+            there is no such drift.
+        """
+        if self.steady is None and self.turning is None:
+            return None
+        found = np.zeros((len(self), 6, DRIFT))
+        if self.steady is not None:
+            for axis in range(3):
+                found[:, 3 + axis, [axis, 3 + axis]] = self.steady[:, :, axis]
+        if self.turning is not None:
+            found[:, :3, 6:] = up[:, None] * self.turning[:, None]
+        return found
+
     @property
     def path(self) -> FloatArray:
         """Path length from the start to each key pose in metres, shape (K,)."""
@@ -111,6 +147,7 @@ class OdometrySteps:
             covariance=self.covariance[:count],
             fixed_axes=fixed,
             steady=None if self.steady is None else self.steady[:count],
+            turning=None if self.turning is None else self.turning[:count],
         )
 
     def as_walk(self, over_m: float) -> "OdometrySteps":
@@ -120,17 +157,19 @@ class OdometrySteps:
         after ``over_m`` metres.
         """
         walked = self.with_scale_as_drift(over_m)
-        if walked.steady is None:
+        drifts = walked.drifts(np.array([0.0, 0.0, 1.0]))
+        if drifts is None:
             return walked
         length = np.linalg.norm(self.p, axis=1)
         # Per metre at the drive's mean speed, both kinds together.
         total = float(length.sum())
-        share = np.hypot(*walked.steady.sum(axis=0)) / total if total else np.zeros(3)
-        along, _, vertical = share**2
+        share = np.linalg.norm(drifts.sum(axis=0), axis=1) / total if total else np.zeros(6)
+        turned, along, vertical = share[[2, 3, 5]] ** 2
         shape = stretched(self.up, vertical / along if along else 1.0)
-        covariance = walked.covariance.copy()
-        covariance[:, 3:, 3:] += (along * over_m * length)[:, None, None] * shape
-        return replace(walked, covariance=covariance, steady=None)
+        covariance, walk = walked.covariance.copy(), (over_m * length)[:, None, None]
+        covariance[:, :3, :3] += turned * walk * self.up[:, :, None] * self.up[:, None]
+        covariance[:, 3:, 3:] += along * walk * shape
+        return replace(walked, covariance=covariance, steady=None, turning=None)
 
     def with_scale_as_drift(self, over_m: float) -> "OdometrySteps":
         """Return steps for solvers without a scale variable.
@@ -202,7 +241,7 @@ def odometry_steps(
         for jump in jumps:
             covariance[np.searchsorted(rows, jump.row)] += jump.covariance
     seconds = 1e-9 * np.diff(trajectory.stamp_ns[rows])
-    share = steady_share(options, is_stated=stated is not None)
+    share, turn = steady_share(options, is_stated=stated is not None), steady_turn(options)
     return OdometrySteps(
         R,
         p,
@@ -211,6 +250,7 @@ def odometry_steps(
         scale=options.scale,
         fixed_axes=fixed,
         steady=steady_weights(seconds, p, share) if share.any() else None,
+        turning=steady_weights(seconds, p, turn)[:, :, 0] if turn.any() else None,
         up_start=trajectory.R[rows[0], 2],
     )
 

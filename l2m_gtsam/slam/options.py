@@ -174,6 +174,10 @@ class DriftOptions(Options):
     as by a current, wind or a slope, as a share of the distance. It is estimated with the poses
     beside the independent errors. `position_share` where that counts, if not given; 0 for none. Not
     with `scale`."""
+    steady_turn_deg_per_m: float = Field(default=0.0, ge=0)
+    """Standard deviation of a turning about the third axis of the frame of the poses that is the
+    same all along the drive, as by a gyroscope's bias or by unequal wheels, in degrees per metre.
+    It is estimated with the poses. 0 for none. Not with `scale`."""
     axes: StepAxes = StepAxes.VEHICLE
     """Along which axes steps and turns are known: `vehicle`, as by wheels or scans, where an error
     of the heading turns all later steps; or `fixed`, as by beacons, where it turns none, and an
@@ -203,6 +207,8 @@ class DriftOptions(Options):
             raise ValueError("`scale` and `axes: fixed`: a scale is that of wheels, give one")
         if self.scale and self.steady:
             raise ValueError("`scale` and `steady`: one drive hardly separates them, give one")
+        if self.scale and self.steady_turn_deg_per_m:
+            raise ValueError("`scale` and `steady_turn_deg_per_m`: one is estimated, give one")
         return self
 
 

@@ -29,6 +29,7 @@ from l2m_factors import (
 )
 from l2m_gtsam.calibration.factor_graph import unit_priors
 from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
 from l2m_gtsam.slam.links import MAP, Links
 from l2m_gtsam.slam.map_prediction import poses_in
@@ -37,7 +38,6 @@ from l2m_gtsam.solve.linear_algebra import information_root
 
 EXACT = 1e-9  # m, uT, or of an entry of C: sigma of parameters that are stated as exact
 ROUNDING = 1e-9  # of a variance: smaller ones are those of a file's last digits
-DRIFT = 6  # components of a steady drift
 # Successive key poses whose residuals in Python are one factor. Four iterations on 353 key poses
 # with one tile took 4.5 s of a processor with a factor for each residual, 2.6 with 4 and with 8 key
 # poses in a factor, 2.8 with 16 and 4.1 with 32.
@@ -148,10 +148,10 @@ def successive(key_poses: Sequence[int]) -> Iterator[list[int]]:
 
 def odometry_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
     """Return the factors of start and odometry."""
-    graph, sigma, steady = gtsam.NonlinearFactorGraph(), drive.steps.scale, drive.steps.steady
+    graph, sigma, drifts = gtsam.NonlinearFactorGraph(), drive.steps.scale, drive.drifts
     graph.add(start_factor(drive.start))
-    if steady is not None:
-        steps = [drifting_residual(drive, number, own) for number, own in enumerate(steady)]
+    if drifts is not None:
+        steps = [drifting_residual(drive, number, own) for number, own in enumerate(drifts)]
         for first in range(0, len(steps), TOGETHER):
             graph.add(joint_residual(steps[first : first + TOGETHER]).factor())
         graph.push_back(unit_priors({V(): DRIFT}))
@@ -170,7 +170,7 @@ def shared_values(drive: Drive) -> gtsam.Values:
     values = gtsam.Values()
     if drive.steps.scale:
         values.insert(G(), 0.0)
-    if drive.steps.steady is not None:
+    if drive.drifts is not None:
         values.insert(V(), np.zeros(DRIFT))
     return values
 
@@ -198,7 +198,7 @@ def pose_values(poses: list[gtsam.Pose3]) -> gtsam.Values:
 
 
 def steady_drift(values: gtsam.Values) -> FloatArray | None:
-    """Return odometry's steady drift in its standard deviations, shape (6,); None if it is none."""
+    """Return odometry's steady drift in its standard deviations, shape (8,); None if it is none."""
     return np.asarray(values.atVector(V())) if values.exists(V()) else None
 
 
@@ -233,7 +233,7 @@ def solve_pose_graph(drive: Drive, confidence: float) -> PoseGraph:
     if not len(drive.links):
         return PoseGraph(poses, np.empty(0, dtype=np.bool_))
     # The optimiser copies its factors, which GTSAM cannot do with those that are written in Python.
-    plain = replace(drive.steps, scale=0.0, steady=None, fixed_axes=None)
+    plain = replace(drive.steps, scale=0.0, steady=None, turning=None, fixed_axes=None)
     graph = odometry_graph(replace(drive, steps=plain))
     sure = graph.size()
     graph.push_back(link_graph(drive.links))

@@ -39,6 +39,7 @@ from l2m_gtsam.records.localisation_file import (
 from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.record import fields_of
 from l2m_gtsam.records.validation import ChiSquare
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.moved_sensors import calibration_change
 from l2m_gtsam.slam.solution import DriveSolution
@@ -201,13 +202,13 @@ def odometry_covariance(drive: Drive) -> FloatArray:
 
 
 def _moved_by_drift(drive: Drive, poses: list[gtsam.Pose3]) -> FloatArray:
-    """Return right perturbations of K poses by units of a steady drift, shape (K, 6, 6)."""
-    moved_by = np.zeros((len(poses), 6, 6))
-    if drive.steps.steady is not None:
-        R_back = np.stack([each.rotation().matrix().T for each in poses])
-        sums = np.vstack([np.zeros((1, 2, 3)), np.cumsum(drive.steps.steady, axis=0)])
-        moved_by[:, 3:, :3] = R_back * sums[:, :1]
-        moved_by[:, 3:, 3:] = R_back * sums[:, 1:]
+    """Return right perturbations of K poses by units of a steady drift, shape (K, 6, 8)."""
+    moved_by, drifts = np.zeros((len(poses), 6, DRIFT)), drive.drifts
+    if drifts is not None:
+        for k, own in enumerate(drifts):
+            before, after = poses[k : k + 2]
+            carried = after.between(before).AdjointMap() @ moved_by[k]
+            moved_by[k + 1] = carried + np.kron(np.eye(2), after.rotation().matrix().T) @ own
     return moved_by
 
 

@@ -44,7 +44,7 @@ class DriveSolution:
     scale
         Scale of odometry; None where it is no variable.
     steady
-        Estimate of odometry's steady drift in its standard deviations, shape (6,), if it was a
+        Estimate of odometry's steady drift in its standard deviations, shape (8,), if it was a
         variable.
     link_squared
         Squared lengths of the scan links' whitened residuals, shape (L,).

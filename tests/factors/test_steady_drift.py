@@ -25,9 +25,12 @@ def drawn(seed: int) -> tuple[gtsam.Pose3, FloatArray, gtsam.Values]:
     """Return a step, weights of a drift, and two key poses that are about so far apart."""
     rng = np.random.default_rng(seed)
     step, values = drawn_step(rng)
-    values.insert(V(), rng.normal(size=6))
-    shape = (2, 3) if seed % 2 else (2,)  # along each axis, or the same along all
-    return step, rng.uniform(0.0, 0.3, shape), values
+    shape = [(2,), (2, 3), (6, 8)][seed % 3]  # along all axes alike, along each, and turning
+    weights = rng.uniform(0.0, 0.3, shape)
+    if len(weights) == 6:
+        weights[:3] = np.outer(rng.normal(size=3), rng.uniform(0.0, 0.3, 8))
+    values.insert(V(), rng.normal(size=drift_weights(weights).shape[1]))
+    return step, weights, values
 
 
 @given(seed=st.integers(0, 10_000))
@@ -46,17 +49,18 @@ def test_derivatives_are_those_of_finite_differences(seed: int) -> None:
 def test_a_step_without_its_drift_is_the_plain_one(seed: int) -> None:
     """GTSAM's own factor and that of fixed axes; rounding of a logarithm is less than 1e-9."""
     step, weights, values = drawn(seed)
-    added = drift_weights(weights) @ values.atVector(V())
-    own = values.atPose3(X(4)).rotation().unrotate(added)
-    still = gtsam.Pose3(step.rotation(), step.translation() - own)
+    turn, added = np.split(drift_weights(weights) @ values.atVector(V()), 2)
+    axes = values.atPose3(X(4)).rotation()
+    back = gtsam.Rot3.Expmap(-axes.unrotate(turn))
+    still = gtsam.Pose3(back.compose(step.rotation()), step.translation() - axes.unrotate(added))
     plain = gtsam.BetweenFactorPose3(X(4), X(5), still, NOISE)
     ours = drifting_step(4, step, weights).factor(NOISE)
     np.testing.assert_allclose(
         ours.unwhitenedError(values), plain.unwhitenedError(values), atol=1e-9
     )
-    way, turn = step.translation(), step.rotation()
-    fixed = fixed_axes_step_factor(4, turn, way - added, NOISE)
-    drifting = drifting_fixed_axes_step(4, turn, way, weights).factor(NOISE)
+    way, turned = step.translation(), gtsam.Rot3.Expmap(-turn).compose(step.rotation())
+    fixed = fixed_axes_step_factor(4, turned, way - added, NOISE)
+    drifting = drifting_fixed_axes_step(4, step.rotation(), way, weights).factor(NOISE)
     np.testing.assert_allclose(
         drifting.unwhitenedError(values), fixed.unwhitenedError(values), atol=1e-12
     )

@@ -17,7 +17,7 @@ from l2m_gtsam.errors import InputError
 from l2m_gtsam.geometry import between
 from l2m_gtsam.recording.sync import at_poses, has_pose, interpolated, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
-from l2m_gtsam.slam.drift import steady_share
+from l2m_gtsam.slam.drift import steady_share, steady_turn
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import Links
@@ -378,10 +378,12 @@ class Intake:
         steps = odometry_steps(trajectory, rows, options.drift)
         if self._drift_axes is None:
             steps, steady = steps.as_walk(options.drift.over_m), np.zeros(3)
+            turning = np.zeros(3)
         else:
             steps = steps.with_scale_as_drift(options.drift.over_m)
             share = steady_share(options.drift, is_stated=steps.stated)[0]
             steady = share * self._drift_axes
+            turning = steady_turn(options.drift) * self.state.first_R[2]
         of_key_pose = key_pose_readings(readings, trajectory, rows)
         return ArrivedKeyPose(
             number,
@@ -394,6 +396,7 @@ class Intake:
             Links.none(),
             fixed=self._fixed(poses[0].T, poses[row].T),
             steady=steady,
+            turning=turning,
         )
 
     def _fixed(self, before: RigidTransform, after: RigidTransform) -> FixedStep | None:

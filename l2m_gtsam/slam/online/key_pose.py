@@ -10,8 +10,9 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import KeyPoseReadings
+from l2m_factors import KeyPoseReadings, drift_weights
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, joined_rows
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
 from l2m_gtsam.slam.key_pose_readings import joined_readings, no_readings
 from l2m_gtsam.slam.links import Links
@@ -68,6 +69,9 @@ class ArrivedKeyPose:
     steady
         Standard deviation of odometry's steady drift along each axis of the frame of the poses as a
         share of the distance, shape (3,). 0 for none.
+    turning
+        Standard deviation of a steady turning about the third axis of the frame of the poses, along
+        the axes of the first key pose, radians per metre, shape (3,). 0 for none.
     recorded
         The same key pose by the step that odometry recorded with its stated error, where that is in
         doubt: this one goes on with the motion before, which is far from it, or is more uncertain,
@@ -86,6 +90,7 @@ class ArrivedKeyPose:
     scans: tuple[ScanAtKeyPose, ...] = ()
     fixed: FixedStep | None = None
     steady: FloatArray = field(default_factory=lambda: np.zeros(3))
+    turning: FloatArray = field(default_factory=lambda: np.zeros(3))
     recorded: "ArrivedKeyPose | None" = None
 
     @property
@@ -129,6 +134,17 @@ class ArrivedKeyPose:
         same, and the mean speed is not known yet.
         """
         return np.stack([np.zeros(3), self.steady * self.length_m])
+
+    @property
+    def drift(self) -> FloatArray:
+        """What a unit of each component of the drift adds along the axes of the first key pose.
+
+        Rotation (rad) before translation (m), shape (6, 8), as of ``OdometrySteps.drifts``.
+        """
+        found = np.zeros((POSE, DRIFT))
+        found[:, :POSE] = drift_weights(self.steady_m)
+        found[:3, -1] = self.turning * self.length_m
+        return found
 
     def without_readings(self) -> "ArrivedKeyPose":
         """Return it by odometry alone."""
@@ -176,6 +192,11 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
     steps = key_poses[1:]
     shifts = [each.fixed.shift for each in steps if each.fixed is not None]
     steady = np.reshape([each.steady_m for each in steps], (-1, 2, 3))
+    turning = np.array([np.linalg.norm(each.turning) * each.length_m for each in steps])
+    up_start = start.T_map_lidar.R[2]
+    if turning.any():
+        axis = steps[0].turning
+        up_start = axis / np.linalg.norm(axis)
     return Drive(
         stamp_ns=np.array([each.stamp_ns for each in key_poses], dtype=np.int64),
         steps=OdometrySteps(
@@ -185,7 +206,8 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
             stated=False,
             fixed_axes=np.stack(shifts) if shifts and len(shifts) == len(steps) else None,
             steady=steady if steady.any() else None,
-            up_start=start.T_map_lidar.R[2],
+            turning=np.column_stack([0.0 * turning, turning]) if turning.any() else None,
+            up_start=up_start,
         ),
         readings=joined_readings([each.readings for each in key_poses]),
         start=start,

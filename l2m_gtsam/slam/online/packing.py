@@ -7,10 +7,12 @@ from typing import Any
 import gtsam
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, RigidTransform, joined_rows
 from l2m_gtsam.maps.potential import PotentialHyperparameters
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import as_poses
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose
 from l2m_gtsam.slam.key_pose_readings import joined_readings
@@ -70,6 +72,7 @@ def packed_key_poses(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
         "p": np.reshape([each.p for each in key_poses], (-1, 3)),
         "covariance": np.reshape([each.covariance for each in key_poses], (-1, 6, 6)),
         "steady": np.reshape([each.steady for each in key_poses], (-1, 3)),
+        "turning": np.reshape([each.turning for each in key_poses], (-1, 3)),
         "count": np.array([len(each.readings) for each in key_poses], dtype=np.int64),
         "reading_ns": np.concatenate(
             [np.empty(0, dtype=np.int64), *(each.reading_ns for each in key_poses)]
@@ -99,6 +102,7 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
     of_links = under("link", arrays)
     links = Links(*(of_links[name] for name in LINKS))
     fixed = under("fixed", arrays)
+    turning = arrays.get("turning", np.zeros((len(arrays["number"]), 3)))  # older states have none
     found, reading, link = [], 0, 0
     for k in range(len(arrays["number"])):
         rows = np.arange(reading, reading + int(arrays["count"][k]))
@@ -117,6 +121,7 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
                 links[own],
                 fixed=step if np.isfinite(step.shift).all() else None,
                 steady=np.broadcast_to(arrays["steady"][k], 3),  # older states have one
+                turning=turning[k],
             )
         )
     return found
@@ -270,6 +275,10 @@ def _packed_beginning(beginning: SolvedBeginning) -> Arrays:
 
 def _unpacked_beginning(arrays: Arrays) -> SolvedBeginning:
     weights, distortion, steady, covariance = (arrays[name] for name in STATE)
+    if len(steady) < DRIFT:  # an older state, which knew no turning
+        more = DRIFT - len(steady)
+        steady = np.append(steady, np.zeros(more))
+        covariance = block_diag(covariance, np.eye(more))
     poses = tuple(unpacked_poses(under("poses", arrays)))
     # The last pose is the state's, and the likelihood counts readings from there on.
     state = FilterState(poses[-1], weights, distortion, steady, covariance, 0.0)

@@ -113,18 +113,22 @@ class TrackedDrift:
         before
             Of the key pose before.
         """
-        drift_m = drift_of(key_pose)
-        if not drift_m.any():
+        drift_m, turn = drift_of(key_pose), np.linalg.norm(key_pose.turning)
+        if not drift_m.any() and not turn:
             return key_pose
         R = before.pose.rotation().matrix()
         to_end = (R @ key_pose.R).T
+        up = to_end[:, 2]
         # What is not known is the same all along: as a walk it has that variance after this way.
         over = max(self.over_m, self.unobserved_m) / key_pose.length_m
         covariance = key_pose.covariance.copy()
         left = drift_m[:, None] * self.known.covariance * drift_m
         covariance[3:, 3:] += over * (to_end @ left @ to_end.T)
+        # Readings in a map tell the heading all along: it drifts between them alone.
+        covariance[:3, :3] += self.over_m * key_pose.length_m * turn**2 * np.outer(up, up)
         p = key_pose.p - R.T @ (drift_m * self.known.drift)
-        return replace(key_pose, p=p, covariance=covariance, steady=np.zeros(3))
+        none = np.zeros(3)
+        return replace(key_pose, p=p, covariance=covariance, steady=none, turning=none)
 
     def moved(self, key_pose: ArrivedKeyPose, before: Belief) -> "TrackedDrift":
         """Return it after a step by odometry, arguments as of ``without``."""

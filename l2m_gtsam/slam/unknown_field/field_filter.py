@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import KeyPoseReadings, drift_weights, skew
+from l2m_factors import KeyPoseReadings, skew
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.geometry import carried_back
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings, predict
 from l2m_gtsam.slam.odometry import FixedStep
@@ -21,7 +22,7 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import FieldWithWeights
 from l2m_gtsam.slam.unknown_field.whole_field import WholeField
 
 DISTORTION = 12
-NO_DRIFT = np.zeros(2)
+NO_DRIFT = np.zeros((POSE, DRIFT))
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class FilterStep:
     readings
         n readings relative to its end, so that they correct the pose that is known then.
     steady
-        What a unit of a drift with time and with distance adds, metres, shape (2,) along all axes
-        alike, or (2, 3).
+        What a unit of each component of a steady drift adds along the axes of the field's frame,
+        a turn about one axis (rad) before the way (m), shape (6, 8).
     fixed
         The step along fixed axes, where odometry knows it so.
     """
@@ -63,7 +64,7 @@ class FilterState:
     distortion
         C row by row and H of the sensors, shape (S, 12).
     steady
-        Drift in standard deviations, with time and with distance, shape (6,).
+        Drift in standard deviations, shape (8,).
     covariance
         Of a right perturbation of the pose, weights, distortion and drift.
     log_likelihood
@@ -104,26 +105,26 @@ class FieldFilter:
 
     def start(self) -> FilterState:
         """Return what is known at the first key pose, which is given."""
-        P = np.eye(self._drift + POSE)
+        P = np.eye(self._drift + DRIFT)
         P[:POSE, :POSE] = 0.0
         for i, covariance in enumerate(self._sensors.covariance):
             begin = self._own + DISTORTION * i
             at = slice(begin, begin + DISTORTION)
             P[at, at] = covariance[3:, 3:]
         weights, distortion = np.zeros(len(self._field)), self._sensors.distortion
-        return FilterState(gtsam.Pose3(), weights, distortion, np.zeros(POSE), P, 0.0)
+        return FilterState(gtsam.Pose3(), weights, distortion, np.zeros(DRIFT), P, 0.0)
 
     def after(self, state: FilterState, step: FilterStep) -> FilterState:
         """Return what is known at the end of a step, with its readings."""
-        pose, F, by_drift = _moved(step, state.pose, state.steady)
+        pose, F, by_drift = moved(step, state.pose, state.steady)
         P, drift = state.covariance.copy(), self._drift
         P[:POSE] = F @ P[:POSE] + by_drift @ P[drift:]
         P[:, :POSE] = P[:, :POSE] @ F.T + P[:, drift:] @ by_drift.T
         P[:POSE, :POSE] += step.covariance
-        moved = replace(state, pose=pose, covariance=P)
+        here = replace(state, pose=pose, covariance=P)
         if not len(step.readings):
-            return moved
-        residual, H, volume = self._linearised(moved, step.readings)
+            return here
+        residual, H, volume = self._linearised(here, step.readings)
         change, P, likely = _updated(P, H, residual, self._largest)
         return FilterState(
             pose.retract(change[:POSE]),
@@ -152,7 +153,7 @@ class FieldFilter:
                 predicted.by_lidar @ lever,
                 turned @ features,
                 by_distortion(where, features @ state.weights, len(known.names)),
-                np.zeros((len(readings), 3, POSE)),
+                np.zeros((len(readings), 3, DRIFT)),
             ],
             axis=2,
         )
@@ -186,7 +187,7 @@ class DeadReckoning:
     walk
         Covariance of a right perturbation by errors of single steps, shape (6, 6).
     by_drift
-        Derivative of it by a steady drift in its standard deviations, shape (6, 6).
+        Derivative of it by a steady drift in its standard deviations, shape (6, 8).
     """
 
     pose: gtsam.Pose3
@@ -196,7 +197,7 @@ class DeadReckoning:
     @classmethod
     def at_start(cls) -> "DeadReckoning":
         """Return the first key pose, which is exact."""
-        return cls(gtsam.Pose3(), np.zeros((POSE, POSE)), np.zeros((POSE, POSE)))
+        return cls(gtsam.Pose3(), np.zeros((POSE, POSE)), np.zeros((POSE, DRIFT)))
 
     @property
     def covariance(self) -> FloatArray:
@@ -205,33 +206,31 @@ class DeadReckoning:
 
     def after(self, step: FilterStep) -> "DeadReckoning":
         """Return the pose after a step."""
-        pose, F, by_drift = _moved(step, self.pose, np.zeros(POSE))
+        pose, F, by_drift = moved(step, self.pose, np.zeros(DRIFT))
         walk = F @ self.walk @ F.T + step.covariance
         return DeadReckoning(pose, walk, F @ self.by_drift + by_drift)
 
 
-def _moved(
+def moved(
     step: FilterStep, pose: gtsam.Pose3, steady: FloatArray
 ) -> tuple[gtsam.Pose3, FloatArray, FloatArray]:
     """Return a pose after a step, and its derivatives by the one before and by a steady drift.
 
     Those by the pose are of right perturbations.
     """
-    W = drift_weights(step.steady)
-    F, by_drift = np.zeros((POSE, POSE)), np.zeros((POSE, POSE))
+    turned, drift = np.split(step.steady @ steady, 2)
+    before, back = pose.rotation(), gtsam.Rot3.Expmap(-turned)
     if step.fixed is None:
-        drift = pose.rotation().matrix().T @ W @ steady
-        motion = step.motion
-        motion = gtsam.Pose3(motion.rotation(), motion.translation() - drift)
-        after, F = pose.compose(motion), motion.inverse().AdjointMap()
-        F[3:, :3] -= motion.rotation().matrix().T @ skew(drift[None])[0]
+        R, way = step.motion.rotation(), step.motion.translation()
+        axes, shift = before.compose(R), before.rotate(way)
+        by_turn = np.vstack([R.matrix().T, -skew(way[None])[0]])
     else:
-        turn = gtsam.Rot3(step.fixed.turn)
-        place = pose.translation() + step.fixed.shift - W @ steady
-        after = gtsam.Pose3(turn.compose(pose.rotation()), place)
-        F[:3, :3] = np.eye(3)
-        F[3:, 3:] = after.rotation().between(pose.rotation()).matrix()
-    by_drift[3:] = -after.rotation().matrix().T @ W
+        axes, shift = gtsam.Rot3(step.fixed.turn).compose(before), step.fixed.shift
+        by_turn = np.vstack([np.eye(3), np.zeros((3, 3))])
+    after = gtsam.Pose3(back.compose(axes), pose.translation() + shift - drift)
+    F = np.hstack([by_turn, np.vstack([np.zeros((3, 3)), np.eye(3)])])
+    F[3:] = after.rotation().between(before).matrix() @ F[3:]
+    by_drift = -np.kron(np.eye(2), after.rotation().matrix().T) @ step.steady
     return after, F, by_drift
 
 

@@ -105,6 +105,4 @@ def step_of(key_pose: ArrivedKeyPose) -> FilterStep:
     readings = key_pose.readings
     if len(readings):
         readings = from_end(readings, key_pose.R, key_pose.p)
-    return FilterStep(
-        key_pose.step, key_pose.covariance, readings, key_pose.steady_m, key_pose.fixed
-    )
+    return FilterStep(key_pose.step, key_pose.covariance, readings, key_pose.drift, key_pose.fixed)

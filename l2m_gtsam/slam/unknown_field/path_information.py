@@ -24,6 +24,7 @@ from scipy.sparse.linalg import splu
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.geometry import carried_back
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import Drive, stacked
 from l2m_gtsam.slam.marginals import Marginals, pose_covariances
 from l2m_gtsam.slam.online.belief import POSE
@@ -159,7 +160,7 @@ class PathNeighbourhood:
         poses, sensor = self.moved_by(errors[:, None])
         moved = (self._by_pose @ poses.ravel()).reshape(-1, POSE)
         found = self.density.slopes(moved, self.sensor + sensor[:, 0])
-        by_poses, none = self.by_key_poses(found.by_path[None]), np.zeros((1, POSE))
+        by_poses, none = self.by_key_poses(found.by_path[None]), np.zeros((1, DRIFT))
         return np.asarray(self.by_errors(by_poses, none, found.by_sensor[None])[0])
 
     def by_errors(
@@ -172,12 +173,12 @@ class PathNeighbourhood:
         by_poses
             By right perturbations of K key poses, shape (r, K, 6).
         by_drift
-            By odometry's steady drift, shape (r, 6); it counts where that is a variable.
+            By odometry's steady drift, shape (r, 8); it counts where that is a variable.
         by_sensor
             By (t, C row by row, H), shape (r, 15).
         """
         flat = by_poses.reshape(len(by_poses), -1)
-        others = by_drift if self._others == POSE else np.zeros((len(flat), self._others))
+        others = by_drift if self._others == DRIFT else np.zeros((len(flat), self._others))
         by_steps = self._transposed.solve(np.hstack([others, flat]).T).T
         return np.hstack([by_steps, by_sensor @ self._by_sensor])
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from l2m_factors import D, M, V
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import Drive, KnownSensors, as_pose, stacked
 from l2m_gtsam.slam.odometry import FixedStep
 from l2m_gtsam.slam.online.belief import POSE
@@ -101,6 +102,10 @@ def filter_steps(drive: Drive) -> Iterator[FilterStep]:
     those of the first key pose, need be vertical.
     """
     steps, key = drive.steps, drive.readings.key_pose
+    if steps.steady is not None:
+        largest = np.repeat(steps.steady.max(axis=2, keepdims=True), 3, axis=2)
+        steps = replace(steps, steady=largest)
+    drifts = steps.drifts(steps.up_start)
     readings = from_end(drive.readings, steps.R[key], steps.p[key])
     bounds = np.searchsorted(key, np.arange(len(steps) + 1))
     for k in range(len(steps)):
@@ -109,7 +114,7 @@ def filter_steps(drive: Drive) -> Iterator[FilterStep]:
             drive.step(k),
             steps.covariance[k],
             readings[np.arange(bounds[k], bounds[k + 1])],
-            NO_DRIFT if steps.steady is None else steps.steady[k].max(axis=1),
+            NO_DRIFT if drifts is None else drifts[k],
             None if fixed is None else FixedStep(steps.fixed_turns[k], fixed[k]),
         )
 
@@ -324,10 +329,10 @@ def end_state(smooth: SmoothedDrive) -> FilterState:
     weights, K = values.atVector(M(0)), len(poses)
     of_path, pose = near.density.weights(weights, near.sensor), poses[0].between(poses[-1])
     m, distortion = len(weights), SENSOR - 3
-    steady = values.atVector(V()) if values.exists(V()) else np.zeros(POSE)
+    steady = values.atVector(V()) if values.exists(V()) else np.zeros(DRIFT)
     # Rows: relative pose, weights, distortion, drift.
-    size = POSE + m + distortion + POSE
-    by_poses, by_drift = np.zeros((size, K, POSE)), np.zeros((size, POSE))
+    size = POSE + m + distortion + DRIFT
+    by_poses, by_drift = np.zeros((size, K, POSE)), np.zeros((size, DRIFT))
     by_sensor = np.zeros((size, SENSOR))
     own, of_weights = np.arange(POSE), slice(POSE, POSE + m)
     by_poses[own, -1, own] = 1.0
@@ -335,11 +340,11 @@ def end_state(smooth: SmoothedDrive) -> FilterState:
     by_poses[of_weights] = near.by_key_poses(of_path.by_path)
     by_sensor[of_weights] = of_path.by_sensor
     by_sensor[POSE + m : POSE + m + distortion, 3:] = np.eye(distortion)
-    by_drift[size - POSE :] = np.eye(POSE)
+    by_drift[size - DRIFT :] = np.eye(DRIFT)
     root = near.by_errors(by_poses, by_drift, by_sensor)
     taken = root @ determined(near, VECTORS)
     covariance = root @ root.T - taken @ taken.T
     covariance[of_weights, of_weights] += of_path.covariance
     if not values.exists(V()):
-        covariance[size - POSE :, size - POSE :] = np.eye(POSE)
+        covariance[size - DRIFT :, size - DRIFT :] = np.eye(DRIFT)
     return FilterState(pose, weights, values.atVector(D(0)).reshape(1, -1), steady, covariance, 0.0)

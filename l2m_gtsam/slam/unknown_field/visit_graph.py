@@ -15,12 +15,12 @@ from scipy.linalg import cho_factor, cho_solve
 
 from l2m_factors import drift_weights
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.odometry import OdometrySteps
 from l2m_gtsam.slam.options import DriftOptions
 from l2m_gtsam.slam.unknown_field.changed_visits import MOTION, Motion
 
 POSE = 6
-DRIFT = 6  # components of a steady drift
 
 
 @dataclass(frozen=True)
@@ -36,23 +36,30 @@ class Way:
     steady
         Metres that one unit of the drifts with time and with distance adds along each axis of the
         frame of the poses, shape (2, 3).
+    turning
+        Right perturbation of it by one unit of a turning with time and with distance, shape (6, 2).
     """
 
     T: gtsam.Pose3
     covariance: FloatArray
     steady: FloatArray
+    turning: FloatArray
 
     @classmethod
     def over(cls, steps: OdometrySteps, first: int, last: int) -> "Way":
         """Return the way between two key poses."""
-        T, covariance = gtsam.Pose3(), np.zeros((POSE, POSE))
+        T, covariance, turning = gtsam.Pose3(), np.zeros((POSE, POSE)), np.zeros((POSE, 2))
+        up = steps.up if steps.turning is not None else None
         for k in range(first, last):
             step = gtsam.Pose3(gtsam.Rot3(steps.R[k]), steps.p[k])
             carried = step.inverse().AdjointMap()
             covariance = carried @ covariance @ carried.T + steps.covariance[k]
+            turning = carried @ turning
+            if up is not None and steps.turning is not None:
+                turning[:3] += up[k][:, None] * steps.turning[k]
             T = T.compose(step)
         steady = np.zeros((2, 3)) if steps.steady is None else steps.steady[first:last].sum(axis=0)
-        return cls(T, covariance, steady)
+        return cls(T, covariance, steady, turning)
 
 
 def ways_between(steps: OdometrySteps, key_poses: Sequence[int]) -> tuple[Way, ...]:
@@ -114,7 +121,8 @@ class VisitGraph:
         rows, by = self.relative(number, number + 1)
         drift = np.zeros((POSE, DRIFT))
         R = self.nodes[number + 1].rotation().matrix()
-        drift[3:] = R.T @ drift_weights(way.steady)
+        drift[3:, :POSE] = R.T @ drift_weights(way.steady)[3:]
+        drift[:, POSE:] = way.turning
         size = POSE * len(self.nodes)
         return np.append(rows, size + np.arange(DRIFT)), np.hstack([by, drift])
 
@@ -135,7 +143,7 @@ class SolvedVisits:
     graph
         Visits where they were.
     mean, covariance
-        Of their right perturbations, and of the drift, shapes (6 V + 6,) and both ways.
+        Of their right perturbations, and of the drift, shapes (6 V + 8,) and both ways.
     """
 
     graph: VisitGraph

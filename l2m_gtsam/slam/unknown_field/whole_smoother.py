@@ -219,7 +219,11 @@ def at_odometry(drive: Drive, prior: WholePrior, options: SlamOptions) -> FieldS
     """
     whole, noise = options.whole_field, prior.spectrum.noise.floored()
     steps = replace(
-        drive.steps, covariance=HELD**2 * drive.steps.covariance, scale=0.0, steady=None
+        drive.steps,
+        covariance=HELD**2 * drive.steps.covariance,
+        scale=0.0,
+        steady=None,
+        turning=None,
     )
     sensors = with_noise(drive.sensors.loosened(whole.distortion, whole.offset), noise)
     held = replace(drive, steps=steps, sensors=sensors)

@@ -23,16 +23,20 @@ from tests.drives.localised import WORLD, driven, localised, record
 from tests.support.pose_errors import pose_nees, position_error
 
 
-@pytest.mark.parametrize(("scale", "vertical"), [(0.03, None), (0.0, 1.0), (0.0, 0.3)])
+@pytest.mark.parametrize(
+    ("scale", "vertical", "turn"),
+    [(0.03, None, 0.0), (0.0, 1.0, 0.0), (0.0, 0.3, 0.0), (0.0, None, 0.02), (0.0, 1.0, 0.02)],
+)
 def test_odometry_with_shared_errors_is_as_sure_as_its_graph(
-    scale: float, vertical: float | None
+    scale: float, vertical: float | None, turn: float
 ) -> None:
-    """A scale, or a steady drift, of which less may be vertical."""
+    """A scale, or a steady drift, of which less may be vertical, and which may turn."""
     drive = localised().solution.drive
     steady = drive.steps.steady
     assert steady is not None
     kept = None if vertical is None else steady * np.array([1.0, 1.0, vertical])
-    drive = replace(drive, steps=replace(drive.steps, scale=scale, steady=kept))
+    turning = turn * np.abs(steady[:, :, 0]) / np.abs(steady[:, 1, 0]).mean() if turn else None
+    drive = replace(drive, steps=replace(drive.steps, scale=scale, steady=kept, turning=turning))
     values = drive_values(drive, drive.dead_reckoning())
     marginals = gtsam.Marginals(odometry_graph(drive), values)
     found = odometry_covariance(drive)

@@ -45,7 +45,7 @@ def line(rng: np.random.Generator, count: int = 40) -> FloatArray:
 AT, MOMENT = np.array([0.5, 1.6, 0.5]), np.array([30.0, -15.0, 21.0])
 FIRST, LATER = np.arange(10), np.arange(100, 110)  # key poses of the visits
 TURN, SHIFT = np.array([0.01, -0.01, 0.04]), np.array([0.1, -0.1, 0.02])
-WAY = Way(gtsam.Pose3(), np.diag(MOTION**2), np.zeros(2))
+WAY = Way(gtsam.Pose3(), np.diag(MOTION**2), np.zeros((2, 3)), np.zeros((6, 2)))
 
 
 def seen(world: DipoleWorld, points: FloatArray, rng: np.random.Generator, first: int) -> Seen:
@@ -118,7 +118,7 @@ def test_where_it_was_is_found_again() -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_what_came_is_found(seed: int) -> None:
     """From one side, 0.8 m and more away: within its sigmas, which are a tenth of that."""
-    known = Way(gtsam.Pose3(), (0.05 * np.diag(MOTION)) ** 2, np.zeros(2))
+    known = replace(WAY, covariance=(0.05 * np.diag(MOTION)) ** 2)
     found = judged(visits(seed, 0.0, off=0.0), known)
     change = found.first_change()
     assert change is not None

@@ -10,6 +10,7 @@ from l2m_factors import M, X
 from l2m_gtsam.data import FieldSeries, Recording, SourceFile, Trajectory
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
 from l2m_gtsam.progress import silent
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import EXACT_START
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
@@ -74,13 +75,13 @@ def test_pose_and_sensor_have_the_covariance_of_the_path(
     np.testing.assert_allclose(state.pose.matrix(), relative.matrix(), atol=1e-12)
     expected = by_ends @ joint @ by_ends.T
     scale = np.sqrt(np.diag(expected))
-    # Both find all of the 75 eigenvalues; products are finite differences.
+    # Both find all of the 77 eigenvalues; products are finite differences.
     np.testing.assert_allclose(
         state.pose_covariance / np.outer(scale, scale),
         expected / np.outer(scale, scale),
         atol=1e-6,
     )
-    own = slice(-18, -6)
+    own = slice(-12 - DRIFT, -DRIFT)
     distortion = (smooth.drive.sensors.covariance[0] - path.sensor @ path.sensor.T)[3:, 3:]
     np.testing.assert_allclose(
         np.diag(state.covariance)[own], np.diag(distortion), rtol=1e-6, atol=1e-12
@@ -90,7 +91,7 @@ def test_pose_and_sensor_have_the_covariance_of_the_path(
 def test_it_is_a_covariance_that_says_more_than_the_priors(smooth: SmoothedDrive) -> None:
     state, m = end_state(smooth), len(smooth.prior.field)
     P = state.covariance
-    assert P.shape == (6 + m + 12 + 6, 6 + m + 12 + 6)
+    assert P.shape == (6 + m + 12 + DRIFT, 6 + m + 12 + DRIFT)
     np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-9 * np.abs(P).max())
     assert np.linalg.eigvalsh(P).min() > -1e-9 * np.linalg.eigvalsh(P).max()
     weights = P[6 : 6 + m, 6 : 6 + m]

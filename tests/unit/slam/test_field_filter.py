@@ -5,11 +5,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from l2m_factors import KeyPoseReadings
+from l2m_factors import KeyPoseReadings, drift_weights
 from l2m_gtsam.data import Distortion, FloatArray
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
+from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.key_pose_readings import no_readings
 from l2m_gtsam.slam.links import Links
@@ -22,6 +25,7 @@ from l2m_gtsam.slam.unknown_field.field_filter import (
     FieldFilter,
     FilterState,
     FilterStep,
+    moved,
 )
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import Hypotheses, Hypothesis
 from l2m_gtsam.slam.unknown_field.whole_field import WholeField
@@ -92,18 +96,53 @@ def test_at_known_poses_the_field_is_the_ridge_solution(field: WholeField) -> No
     assert state.log_likelihood == pytest.approx(log_likelihood, abs=1e-2)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.05])
+def drift_of(motion: gtsam.Pose3, share: float, turn: float) -> FloatArray:
+    """Return what a unit of a drift with distance adds, along a tilted axis where it turns."""
+    length, axis = np.linalg.norm(motion.translation()), np.array([0.6, 0.0, 0.8])
+    found = np.zeros((6, DRIFT))
+    found[:, :6] = drift_weights(np.array([0.0, share * length]))
+    found[:3, 7] = turn * length * axis
+    return found
+
+
 @pytest.mark.parametrize("fixed", [False, True])
-def test_without_readings_it_is_odometry(field: WholeField, fixed: bool, share: float) -> None:
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_derivatives_of_a_step_are_those_of_finite_differences(fixed: bool, seed: int) -> None:
+    """By the pose before and by a drift that turns; both of right perturbations."""
+    rng = np.random.default_rng(seed)
+    pose, motion = (gtsam.Pose3.Expmap(rng.normal(0, 0.7, 6)) for _ in range(2))
+    axes = FixedStep(gtsam.Rot3.Expmap(rng.normal(0, 0.7, 3)).matrix(), rng.normal(size=3))
+    step = FilterStep(
+        motion, np.eye(6), no_readings(), drift_of(motion, 0.3, 0.4), axes if fixed else None
+    )
+    drift = rng.normal(size=DRIFT)
+    _, by_pose, by_drift = moved(step, pose, drift)
+    # Central differences of terms of order one: off by 1e-12, and by rounding of 1e-16 / 1e-6.
+    h = 1e-6
+    for k, change in enumerate(h * np.eye(6)):
+        ends = [moved(step, pose.retract(sign * change), drift)[0] for sign in (1, -1)]
+        slope = gtsam.Pose3.Logmap(ends[1].between(ends[0])) / (2 * h)
+        np.testing.assert_allclose(by_pose[:, k], slope, atol=1e-8)
+    for k, change in enumerate(h * np.eye(DRIFT)):
+        ends = [moved(step, pose, drift + sign * change)[0] for sign in (1, -1)]
+        slope = gtsam.Pose3.Logmap(ends[1].between(ends[0])) / (2 * h)
+        np.testing.assert_allclose(by_drift[:, k], slope, atol=1e-8)
+
+
+@pytest.mark.parametrize(("share", "turn"), [(0.0, 0.0), (0.05, 0.0), (0.05, 0.1)])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_without_readings_it_is_odometry(
+    field: WholeField, fixed: bool, share: float, turn: float
+) -> None:
     """Mean and covariance; along fixed axes errors of turns shift nothing."""
     follows, Q = FieldFilter(field, sensors(), LARGEST), np.diag([1, 2, 3, 4, 5, 6]) * 1e-4
     state, reckoned, poses = follows.start(), DeadReckoning.at_start(), walked()
     length = sum(np.linalg.norm(each.translation()) for each in motions())
     for before, after, motion in zip(poses[:-1], poses[1:], motions(), strict=True):
-        turn = after.rotation().compose(before.rotation().inverse()).matrix()
-        axes = FixedStep(turn, after.translation() - before.translation()) if fixed else None
-        steady = np.array([0.0, share * np.linalg.norm(motion.translation())])
-        step = FilterStep(motion, Q, no_readings(), steady, axes)
+        turned = after.rotation().compose(before.rotation().inverse()).matrix()
+        axes = FixedStep(turned, after.translation() - before.translation()) if fixed else None
+        step = FilterStep(motion, Q, no_readings(), drift_of(motion, share, turn), axes)
         state, reckoned = follows.after(state, step), reckoned.after(step)
     for found in (state.pose, reckoned.pose):
         np.testing.assert_allclose(found.matrix(), poses[-1].matrix(), atol=1e-12)
