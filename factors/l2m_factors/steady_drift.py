@@ -45,9 +45,8 @@ def drifting_step(key_pose: int, step: gtsam.Pose3, weights: FloatArray) -> Resi
 
     def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         before, after = values.atPose3(X(key_pose)), values.atPose3(X(key_pose + 1))
-        back = before.rotation().matrix().T
-        own = np.vstack([back @ W[:3], back @ W[3:]])
-        turn, drift = np.split(own @ values.atVector(V()), 2)
+        back, added = before.rotation().matrix().T, W @ values.atVector(V())
+        turn, drift = back @ added[:3], back @ added[3:]
         turned = gtsam.Rot3.Expmap(-turn)
         without = gtsam.Pose3(turned.compose(step.rotation()), step.translation() - drift)
         off = without.between(before.between(after))
@@ -56,11 +55,12 @@ def drifting_step(key_pose: int, step: gtsam.Pose3, weights: FloatArray) -> Resi
             by_before = -by_off @ before.between(after).inverse().AdjointMap()
             # Turn and drift as a right perturbation of the step: turns about one axis add up, and
             # both keep their axes in the frame where the pose before turns.
-            by_own = -by_off @ off.inverse().AdjointMap()
-            by_own = by_own @ np.kron(-np.eye(2), without.rotation().matrix().T)
-            by_before[:, :3] += by_own[:, :3] @ (np.eye(3) - turned.matrix())
-            by_before[:, :3] += by_own[:, 3:] @ skew(drift[None])[0]
-            jacobians[0], jacobians[1], jacobians[2] = by_before, by_off, by_own @ own
+            by_step, axes = by_off @ off.inverse().AdjointMap(), without.rotation().matrix().T
+            by_turn, by_drift = by_step[:, :3] @ axes, by_step[:, 3:] @ axes
+            by_before[:, :3] += by_turn @ (np.eye(3) - turned.matrix())
+            by_before[:, :3] += by_drift @ skew(drift[None])[0]
+            by_added = by_turn @ back @ W[:3] + by_drift @ back @ W[3:]
+            jacobians[0], jacobians[1], jacobians[2] = by_before, by_off, by_added
         return np.asarray(gtsam.Pose3.Logmap(off))
 
     return Residual([X(key_pose), X(key_pose + 1), V()], 6, error)
@@ -87,9 +87,9 @@ def drifting_fixed_axes_step(
 
     def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         poses = [values.atPose3(X(key_pose + end)) for end in (0, 1)]
-        turned, drift = np.split(W @ values.atVector(V()), 2)
-        without = gtsam.Rot3.Expmap(-turned).compose(turn)
-        found = fixed_axes_residual(poses, without, way - drift, jacobians)
+        added = W @ values.atVector(V())
+        without = gtsam.Rot3.Expmap(-added[:3]).compose(turn)
+        found = fixed_axes_residual(poses, without, way - added[3:], jacobians)
         if jacobians is not None:
             back, by_turn = poses[1].rotation().matrix().T, jacobians[1][:3, :3]
             jacobians[2] = np.vstack([by_turn @ back @ W[:3], back @ W[3:]])

@@ -62,6 +62,23 @@ class OdometryScale(Record):
 
 
 @dataclass(frozen=True)
+class OdometryTurn(Record):
+    """What odometry's steady turning came out as.
+
+    Attributes
+    ----------
+    left_deg_per_m
+        By how much odometry turns too far to the left, degrees per metre in the drive's mean;
+        negative: to the right.
+    sigma
+        Its standard deviation.
+    """
+
+    left_deg_per_m: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class SensorUse(Record):
     """What a sensor's readings were worth.
 
@@ -289,5 +306,6 @@ class LocalisationResult:
     scans: ScanUse | None = None
     by_scans: Trajectory | None = None
     scale: OdometryScale | None = None
+    turn: OdometryTurn | None = None
     gain: Gain | None = None
     hints: tuple[str, ...] = ()

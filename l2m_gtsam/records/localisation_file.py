@@ -13,6 +13,7 @@ from l2m_gtsam.records.localisation import (
     Gain,
     LocalisationStatus,
     OdometryScale,
+    OdometryTurn,
     ScanUse,
     SensorUse,
     StartFinding,
@@ -262,6 +263,9 @@ class LocalisationRecord(Record):
         older versions.
     hints
         What options would make poses better, a sentence each; none in files of older versions.
+    turn
+        Odometry's steady turning; absent where it was not estimated, and in files of older
+        versions.
     """
 
     status: LocalisationStatus
@@ -286,3 +290,4 @@ class LocalisationRecord(Record):
     judgement: Judgement | None = None
     gain: Gain | None = None
     hints: tuple[str, ...] = ()
+    turn: OdometryTurn | None = None

@@ -10,12 +10,12 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
-from l2m_factors import D, G, T, X
+from l2m_factors import D, G, T, V, X
 from l2m_gtsam.calibration.joint_information import columns_at, slices_of
 from l2m_gtsam.calibration.optimise import refused
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.records.localisation import OdometryScale
+from l2m_gtsam.records.localisation import OdometryScale, OdometryTurn
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.selected_inverse import shared_covariances
@@ -306,3 +306,15 @@ def odometry_scale(marginals: Marginals, values: gtsam.Values) -> OdometryScale 
     with reported_ill_conditioning():
         variance = float(marginals.of(G())[0, 0])
     return OdometryScale(values.atDouble(G()), float(np.sqrt(variance)))
+
+
+def odometry_turn(marginals: Marginals, values: gtsam.Values, drive: Drive) -> OdometryTurn | None:
+    """Return the estimate of odometry's steady turning; None where it is no variable."""
+    turning = drive.steps.turning
+    if turning is None:
+        return None
+    with reported_ill_conditioning():
+        covariance = marginals.of(V())[-2:, -2:]
+    per_m = np.rad2deg(turning.sum(axis=0)) / drive.steps.path[-1]
+    sigma = np.sqrt(per_m @ covariance @ per_m)
+    return OdometryTurn(float(per_m @ values.atVector(V())[-2:]), float(sigma))

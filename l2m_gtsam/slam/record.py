@@ -121,6 +121,7 @@ def localisation_record(
         explored=result.explored,
         gain=result.gain,
         hints=result.hints,
+        turn=result.turn,
         scans=result.scans,
         truth=truth,
         picture=map_picture(context.field_map, result.trajectory.p),

@@ -76,6 +76,7 @@ def localisation_result(
         scans=scan_use(solution, by_scans),
         by_scans=_trajectory(drive, by_scans.poses) if len(by_scans.believed) else None,
         scale=solution.scale,
+        turn=solution.turn,
     )
 
 

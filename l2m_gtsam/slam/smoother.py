@@ -19,7 +19,7 @@ from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, ReadingFits, changed
 from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.map_errors import SharedMapErrors, errors_of
 from l2m_gtsam.slam.map_prediction import place_readings, poses_in, predict, sensors_in
-from l2m_gtsam.slam.marginals import Marginals, drive_covariances, odometry_scale
+from l2m_gtsam.slam.marginals import Marginals, drive_covariances, odometry_scale, odometry_turn
 from l2m_gtsam.slam.online.follower import Follower, follow
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
@@ -193,6 +193,7 @@ class SmoothingProblem:
             near_changes=np.zeros(len(weights), dtype=np.bool_),
             odometry_chi2=2 * self._odometry.error(values) / (6 * len(self._drive)),
             scale=odometry_scale(marginals, values),
+            turn=odometry_turn(marginals, values, self._drive),
             steady=steady_drift(values),
             link_squared=link_squared(self._drive.links, values),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,

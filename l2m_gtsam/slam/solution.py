@@ -7,7 +7,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import BoolArray, FloatArray
-from l2m_gtsam.records.localisation import OdometryScale
+from l2m_gtsam.records.localisation import OdometryScale, OdometryTurn
 from l2m_gtsam.slam.drive import Drive, as_pose
 from l2m_gtsam.slam.map_prediction import MapPrediction
 
@@ -43,6 +43,8 @@ class DriveSolution:
         odometry's; 1 is consistent.
     scale
         Scale of odometry; None where it is no variable.
+    turn
+        Steady turning of odometry; None where it is no variable.
     steady
         Estimate of odometry's steady drift in its standard deviations, shape (8,), if it was a
         variable.
@@ -65,6 +67,7 @@ class DriveSolution:
     near_changes: BoolArray
     odometry_chi2: float
     scale: OdometryScale | None
+    turn: OdometryTurn | None
     steady: FloatArray | None
     link_squared: FloatArray
     ending: Ending

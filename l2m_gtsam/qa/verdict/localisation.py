@@ -8,7 +8,12 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.metrics.trajectory import HEADING, LocalisedTrajectory, localised_trajectory
 from l2m_gtsam.qa.options import Limit, QaOptions, SlamQaOptions, thresholds
 from l2m_gtsam.qa.verdict.sensor import outside_map
-from l2m_gtsam.records.localisation import LocalisationStatus, OdometryScale, ScanUse
+from l2m_gtsam.records.localisation import (
+    LocalisationStatus,
+    OdometryScale,
+    OdometryTurn,
+    ScanUse,
+)
 from l2m_gtsam.records.localisation_file import (
     POSE_FREEDOM,
     LocalisationRecord,
@@ -84,6 +89,7 @@ def _shared_reasons(record: LocalisationRecord, options: SlamQaOptions) -> list[
         *(Reason(Level.PASS, each) for each in record.hints),
         _drift(record),
         *([] if record.scale is None else [_scale(record.scale)]),
+        *([] if record.turn is None else [_turn(record.turn)]),
     ]
 
 
@@ -258,6 +264,15 @@ def _scale(scale: OdometryScale) -> Reason:
     text = (
         f"Distances are {with_sigma(100 * abs(scale.longer), 100 * scale.sigma, '%')} (1 sigma) "
         f"{'longer' if scale.longer >= 0 else 'shorter'} than odometry's."
+    )
+    return Reason(Level.PASS, text)
+
+
+def _turn(turn: OdometryTurn) -> Reason:
+    text = (
+        f"Odometry turns by {with_sigma(abs(turn.left_deg_per_m), turn.sigma, 'deg')} (1 sigma) "
+        f"per metre too far to the {'left' if turn.left_deg_per_m >= 0 else 'right'}, all along "
+        "the drive."
     )
     return Reason(Level.PASS, text)
 

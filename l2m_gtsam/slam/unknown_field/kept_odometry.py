@@ -119,6 +119,7 @@ def along_odometry(
         near_changes=np.zeros(len(squared), dtype=np.bool_),
         odometry_chi2=0.0,
         scale=None,
+        turn=None,
         steady=None,
         link_squared=link_squared(drive.links, values),
         ending=Ending.TOLERANCE,

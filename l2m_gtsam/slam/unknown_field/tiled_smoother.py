@@ -20,6 +20,7 @@ from l2m_gtsam.slam.marginals import (
     PoseCovariance,
     drive_covariances,
     odometry_scale,
+    odometry_turn,
 )
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
@@ -199,6 +200,7 @@ class TiledProblem:
             near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
             odometry_chi2=2 * self._odometry.error(solved.values) / (6 * len(drive)),
             scale=odometry_scale(marginals, solved.values),
+            turn=odometry_turn(marginals, solved.values, drive),
             steady=steady_drift(solved.values),
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,

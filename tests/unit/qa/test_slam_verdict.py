@@ -7,7 +7,12 @@ import pytest
 
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.localisation import judge_localisation, localisation_thresholds
-from l2m_gtsam.records.localisation import LocalisationStatus, OdometryScale, ScanUse
+from l2m_gtsam.records.localisation import (
+    LocalisationStatus,
+    OdometryScale,
+    OdometryTurn,
+    ScanUse,
+)
 from l2m_gtsam.records.localisation_file import (
     LocalisationRecord,
     PoseErrors,
@@ -216,6 +221,16 @@ def test_a_scale_that_was_found_is_reported() -> None:
         "2.00 ± 0.10% (1 sigma) longer" in each for each in texts(judged(longer), Level.PASS)
     )
     assert not any("Distances are" in each for each in texts(judged(good()), Level.PASS))
+
+
+def test_a_turning_that_was_found_is_reported() -> None:
+    """Where it is no variable nothing is said of it."""
+    right = replace(good(), turn=OdometryTurn(-0.2113, 0.0048))
+    told = "Odometry turns by 0.2113 ± 0.0048 deg (1 sigma) per metre too far to the right"
+    assert any(each.startswith(told) for each in texts(judged(right), Level.PASS))
+    left = replace(good(), turn=OdometryTurn(0.2, 0.01))
+    assert any("far to the left" in each for each in texts(judged(left), Level.PASS))
+    assert not any("Odometry turns" in each for each in texts(judged(good()), Level.PASS))
 
 
 def test_scans_that_contradict_odometry_are_told() -> None:
