@@ -35,6 +35,7 @@ from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import TruthRecord
 from l2m_gtsam.records.scans import Scan
+from l2m_gtsam.slam.moving_fields import without_moving_fields
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.online.events import OnlineEvent
 from l2m_gtsam.slam.online.replay import give, messages, with_scans
@@ -135,14 +136,15 @@ def slam_online(
         check_truth(truth, recording.trajectory, config.slam.max_pose_gap_s, str(given.truth))
     field_map = None if saved is None else _opened(saved, recording, config, progress)
     matcher, ignored = _matcher_or_why_not(given.bag, saved, config)
-    begun = _begun(calibration, config, field_map, matcher, out, resume=resume)
+    still = without_moving_fields(recording, calibration)
+    begun = _begun(still.calibration, config, field_map, matcher, out, resume=resume)
     if ignored is not None:
         begun.slam.report_scans_ignored(ignored)
     ensure_folder(out)
     with OnlineLog(out / LOG_FILE, begun.lines) as log:
         run = _Run(begun, log, out / STATE_FILE, config.slam.online.save_every_s)
         scans = () if matcher is None else bag_scans(given.bag, config, silent)
-        run.drive(recording, scans, progress)
+        run.drive(still.recording, scans, progress)
     is_refined = begun.slam.options.calibration is CalibrationUse.REFINED
     refined_by = run.last if is_refined else None
     _write_calibration_so_far(refined_by, calibration, given, recording, config, out)

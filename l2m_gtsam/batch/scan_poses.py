@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from l2m_gtsam.batch.files import SavedMap, read_drive, read_drive_and_numbers, read_numbers
+from l2m_gtsam.batch.files import SavedMap, read_drive_and_numbers, read_numbers
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import BagError, LidarError
@@ -61,15 +61,16 @@ def read_drive_or_follow(bag: Path, config: Config, progress: Progress) -> Recor
         Whatever is wrong with the bag or its clouds, in one line.
     """
     if not _by_clouds(bag, config):
-        return read_drive(bag, config, progress)
+        return read_drive_and_numbers(bag, config, progress)
     series = read_fields(bag, config.bag)
+    scalars = read_numbers(bag, config, progress)
     poses = odometry(bag_scans(bag, config, progress), config.lidar.odometry)
     if len(poses) < 2:
         raise LidarError(f"{bag}: fewer than two scans have points enough for odometry")
     poses = replace(poses, frame=config.bag.frame or poses.frame)
     check_clocks(bag, poses, series)
     note = f"{bag}: poses are odometry by its point clouds, which drifts"
-    return Recording(poses, series, source_file(bag), notes=(note,))
+    return Recording(poses, series, source_file(bag), scalars, notes=(note,))
 
 
 def bag_scans(bag: Path, config: Config, progress: Progress) -> ScanTopic:

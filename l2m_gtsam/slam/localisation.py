@@ -29,6 +29,7 @@ from l2m_gtsam.slam.moved_sensors import (
     sensor_to_leave_out,
     without_series,
 )
+from l2m_gtsam.slam.moving_fields import without_moving_fields
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
@@ -203,8 +204,9 @@ def prepared(
         repaired = without_jumps(recording.trajectory, options.jumps)
     odometry = repaired.trajectory
     masked = mask_dropouts(replace(recording, trajectory=odometry))
-    calibrated, left_out = usable_sensors(masked.recording, calibration)
-    readings = drive_readings(masked.recording, calibrated, options)
+    still = without_moving_fields(masked.recording, calibration)
+    calibrated, left_out = usable_sensors(still.recording, still.calibration)
+    readings = drive_readings(still.recording, calibrated, options)
     rows = np.union1d(key_pose_rows(odometry, options.key_poses), repaired.rows)
     if len(evidence):
         rows = with_rows_at(rows, odometry, link_stamps(evidence))
@@ -269,7 +271,9 @@ def why_unusable(entry: SensorCalibration | None) -> str:
     if not is_determined(entry):
         return f"its calibration is {entry.status.value}"
     numbers = ", ".join(each.name for each in entry.moving)
-    return f"a part of its readings follows {numbers}" if numbers else ""
+    if not numbers:
+        return ""
+    return f"a part of its readings follows {numbers}, which is not known (`bag.regressors`)"
 
 
 def is_determined(sensor: SensorCalibration) -> bool:

@@ -80,7 +80,10 @@ def test_a_first_message_of_another_year_is_taken_back(hall: Hall, plain: Online
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"moving": (CURRENT,)}, "a part of its readings follows current"),
+        (
+            {"moving": (CURRENT,)},
+            "a part of its readings follows current, which is not known (`bag.regressors`)",
+        ),
         ({"status": SensorStatus.AMBIGUOUS, "noise": np.nan}, "its calibration is ambiguous"),
         ({"sensor": "other"}, "it has no calibration"),
     ],
