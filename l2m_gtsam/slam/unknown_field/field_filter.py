@@ -178,7 +178,7 @@ def by_distortion(where: PlacedReadings, B: FloatArray, count: int) -> FloatArra
 
 @dataclass(frozen=True)
 class DeadReckoning:
-    """A pose by odometry alone.
+    """A pose by odometry alone, less a steady drift.
 
     Attributes
     ----------
@@ -187,17 +187,21 @@ class DeadReckoning:
     walk
         Covariance of a right perturbation by errors of single steps, shape (6, 6).
     by_drift
-        Derivative of it by a steady drift in its standard deviations, shape (6, 8).
+        Derivative of it by the drift, shape (6, 8).
+    drift
+        In its standard deviations, shape (8,).
     """
 
     pose: gtsam.Pose3
     walk: FloatArray
     by_drift: FloatArray
+    drift: FloatArray
 
     @classmethod
-    def at_start(cls) -> "DeadReckoning":
-        """Return the first key pose, which is exact."""
-        return cls(gtsam.Pose3(), np.zeros((POSE, POSE)), np.zeros((POSE, DRIFT)))
+    def at_start(cls, drift: FloatArray | None = None) -> "DeadReckoning":
+        """Return the first key pose, which is exact, for no drift or for a given one."""
+        drift = np.zeros(DRIFT) if drift is None else drift
+        return cls(gtsam.Pose3(), np.zeros((POSE, POSE)), np.zeros((POSE, DRIFT)), drift)
 
     @property
     def covariance(self) -> FloatArray:
@@ -206,9 +210,17 @@ class DeadReckoning:
 
     def after(self, step: FilterStep) -> "DeadReckoning":
         """Return the pose after a step."""
-        pose, F, by_drift = moved(step, self.pose, np.zeros(DRIFT))
+        pose, F, by_drift = moved(step, self.pose, self.drift)
         walk = F @ self.walk @ F.T + step.covariance
-        return DeadReckoning(pose, walk, F @ self.by_drift + by_drift)
+        return DeadReckoning(pose, walk, F @ self.by_drift + by_drift, self.drift)
+
+    def squared_distance(self, pose: gtsam.Pose3) -> float:
+        """Return that of a pose in sigmas of all errors of odometry; six are expected.
+
+        Where a turning drift has bent the path, this is linear about the drift of this one.
+        """
+        away = gtsam.Pose3.Logmap(self.pose.between(pose)) + self.by_drift @ self.drift
+        return float(away @ np.linalg.solve(self.covariance, away))
 
 
 def moved(

@@ -49,6 +49,7 @@ GROWN = 1.4  # path, after which the drive is solved again: all takes 3.5 times 
 LEFT = 1.25  # the same where the vehicle has left the box, or a correction was refused
 NEAR = 1.0  # lengths of the field, to the faces of the box: nearer, these matter
 IMPOSSIBLE = float(exceeded_by(1e-6, POSE))  # squared distance from odometry in its sigmas
+NEAR_DRIFT = 0.3  # sigmas of odometry's drift, within which a path is linear in it
 LEAST, MOST = 20, 1500  # key poses that are solved as a whole; a round of 350 takes two seconds
 PIECE = 20  # key poses that are followed anew while one comes
 
@@ -125,6 +126,8 @@ class OneFieldExplorer:
         self._path_m, self._learnt_m = 0.0, 0.0
         self._read = ReadPath()
         self._reckoned = DeadReckoning.at_start()
+        # The same less a drift near that of the estimate.
+        self._drifting = DeadReckoning.at_start()
         self._now: FollowedField | None = None
         self._work: Iterator[FollowedField | None] | None = None
         self._open: list[int] = []  # steps in doubt that are not decided
@@ -234,7 +237,9 @@ class OneFieldExplorer:
 
     def _dead_reckon(self, key_pose: ArrivedKeyPose) -> None:
         if key_pose.number > 0:
-            self._reckoned = self._reckoned.after(step_of(key_pose))
+            step = step_of(key_pose)
+            self._reckoned = self._reckoned.after(step)
+            self._drifting = self._drifting.after(step)
 
     def _known(self) -> Belief:
         """Return the posterior of the last key pose, in the map."""
@@ -310,8 +315,14 @@ class OneFieldExplorer:
 
     def _is_possible(self, now: FollowedField) -> bool:
         """Return whether odometry, with the drift that is stated, can have been so far off."""
-        away = gtsam.Pose3.Logmap(self._reckoned.pose.between(now.hypotheses.best.state.pose))
-        return bool(away @ np.linalg.solve(self._reckoned.covariance, away) <= IMPOSSIBLE)
+        state = now.hypotheses.best.state
+        if self._reckoned.squared_distance(state.pose) <= IMPOSSIBLE:
+            return True
+        if np.abs(state.steady - self._drifting.drift).max() > NEAR_DRIFT:
+            self._drifting = DeadReckoning.at_start(state.steady)
+            for each in self._key_poses[1:]:
+                self._drifting = self._drifting.after(step_of(each))
+        return self._drifting.squared_distance(state.pose) <= IMPOSSIBLE
 
     def _refuse(self) -> None:
         """Follow odometry, until field and noise are learnt again at its poses."""

@@ -130,6 +130,22 @@ def test_derivatives_of_a_step_are_those_of_finite_differences(fixed: bool, seed
         np.testing.assert_allclose(by_drift[:, k], slope, atol=1e-8)
 
 
+def test_a_path_that_a_turning_bends_is_as_far_as_its_drift_is_unlikely() -> None:
+    """To first order about a drift near it; about none, 2 rad before, it seems out of reach."""
+    rng, Q = np.random.default_rng(4), np.diag([1e-6] * 3 + [1e-6] * 3)
+    drift = np.append(np.zeros(7), 2.0)
+    plain, true = DeadReckoning.at_start(), DeadReckoning.at_start(drift)
+    near = DeadReckoning.at_start(drift + np.append(np.zeros(7), 0.2))
+    for motion in 4 * motions():
+        step = FilterStep(motion, Q, no_readings(), drift_of(motion, 0.0, 0.07))
+        plain, true, near = (each.after(step) for each in (plain, true, near))
+    pose = true.pose.retract(np.linalg.cholesky(true.walk) @ rng.normal(size=6))
+    # Of the drift two sigmas; the walk adds six in the mean, and at most 25 once in 3,000.
+    assert true.squared_distance(pose) < 2.0**2 + 25
+    assert near.squared_distance(pose) == pytest.approx(true.squared_distance(pose), rel=0.1)
+    assert plain.squared_distance(pose) > 100
+
+
 @pytest.mark.parametrize(("share", "turn"), [(0.0, 0.0), (0.05, 0.0), (0.05, 0.1)])
 @pytest.mark.parametrize("fixed", [False, True])
 def test_without_readings_it_is_odometry(
