@@ -8,12 +8,9 @@ The drive without it decides: there the others are as they were calibrated.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from l2m_gtsam.data import Recording
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import LocalisationResult
-from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.pose_graph import stated_information_root
 from l2m_gtsam.solve.chi_square import exceeded_by
 
@@ -111,36 +108,6 @@ def sensor_to_leave_out(
     if PLAINER * left[name] > min([most, *others]):
         return None
     return MovedSensor(name, changes[name])
-
-
-class CalibrationWatch:
-    """Which calibrations a drive contradicts so far, as it is driven.
-
-    Nothing is left out: whether the others hold without a sensor is known off line only.
-
-    Parameters
-    ----------
-    given
-        Sensors as they were calibrated.
-    """
-
-    def __init__(self, given: KnownSensors) -> None:
-        self._given = given
-        self._roots = np.stack([stated_information_root(each) for each in given.covariance])
-        self._told: set[str] = set()
-
-    def refuted(self, refined: KnownSensors) -> list[MovedSensor]:
-        """Return the sensors that are contradicted now and were not before."""
-        off = refined.vectors() - self._given.vectors()
-        white = np.einsum("sij,sj->si", self._roots, off)
-        changes = zip(self._given.names, np.einsum("si,si->s", white, white), strict=True)
-        found = [
-            MovedSensor(name, float(change))
-            for name, change in changes
-            if change > LARGEST and name not in self._told
-        ]
-        self._told |= {each.sensor for each in found}
-        return found
 
 
 def without_series(recording: Recording, sensors: Iterable[str]) -> Recording:

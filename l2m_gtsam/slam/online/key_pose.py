@@ -152,6 +152,13 @@ class ArrivedKeyPose:
         none = np.empty(0, dtype=np.int64)
         return replace(self, readings=no_readings(), reading_ns=none, recorded=recorded)
 
+    def without_sensor(self, number: int) -> "ArrivedKeyPose":
+        """Return it without the readings of one sensor."""
+        recorded = None if self.recorded is None else self.recorded.without_sensor(number)
+        rows = np.flatnonzero(self.readings.sensor != number)
+        readings, stamps = self.readings[rows], self.reading_ns[rows]
+        return replace(self, readings=readings, reading_ns=stamps, recorded=recorded)
+
     @classmethod
     def first(cls, stamp_ns: int, links: Links) -> "ArrivedKeyPose":
         """Return the first key pose of a drive."""

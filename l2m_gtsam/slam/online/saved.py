@@ -78,6 +78,7 @@ def saved_state(slam: OnlineSlam) -> SavedState:
         str(stamp): [each.kind.value, each.text]
         for stamp, each in slam.intake.state.suspect.items()
     }
+    facts["refuted"], facts["left_out"] = sorted(slam.watch.told), sorted(slam.watch.out)
     if isinstance(slam.matcher, LoopMatcher):
         arrays |= named("loops", packed_loops(slam.matcher))
     estimator, search = slam.estimator, slam.search
@@ -167,6 +168,8 @@ def _resume(slam: OnlineSlam, state: SavedState) -> None:
     arrays, facts = state.arrays, state.facts
     slam.intake.resume(_unpacked_intake(under("intake", arrays), facts["suspect"], slam.intake))
     slam.base, slam.stamp_ns = (int(each) for each in arrays["base"])
+    for told, key in ((slam.watch.told, "refuted"), (slam.watch.out, "left_out")):
+        told.update(set(facts.get(key, ())) & set(slam.sensors.names))  # older states do not say
     if isinstance(slam.matcher, LoopMatcher):
         resume_loops(slam.matcher, under("loops", arrays))
     stages: dict[str, Callable[[], None]] = {

@@ -24,10 +24,10 @@ from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose, as_transform
 from l2m_gtsam.slam.held_calibration import with_calibration_use
 from l2m_gtsam.slam.localisation import known_sensors, left_out, start_pose, why_unusable
-from l2m_gtsam.slam.moved_sensors import CalibrationWatch
 from l2m_gtsam.slam.online.arguments import refuse_unusable
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.branches import Branch, BranchedFollower, GapDoubt
+from l2m_gtsam.slam.online.calibration_watch import CalibrationWatch
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.intake import Intake
@@ -159,7 +159,6 @@ class OnlineSlam:
         self.sensors = self.given_sensors = known_sensors(usable)
         self.options = with_calibration_use(options, self.sensors, one_field=self._one_field)
         self._map = None if field_map is None else for_solvers(field_map)
-        self._watch = CalibrationWatch(self.sensors)
         self.matcher = matcher
         axes = None if field_map is None else np.array([1.0, 1.0, options.drift.of_height])
         # The axes of the one field are the first key pose's, of which none need be vertical.
@@ -171,6 +170,7 @@ class OnlineSlam:
         self._counts: deque[tuple[int, int]] = deque(maxlen=LAST_KEY_POSES)
         self._refused = False
         self._events: list[OnlineEvent] = []
+        self.watch = CalibrationWatch(self.sensors, self._follower)
 
     @one_blas_thread()
     def add_odometry(self, pose: OdometryPose) -> tuple[OnlinePose, ...]:
@@ -223,7 +223,7 @@ class OnlineSlam:
         for key_pose in self.intake.key_poses(to_the_end=to_the_end):
             if self.estimator is None and self.search is None:
                 self._begin()
-            yield from self._added(renumbered(key_pose, self.base))
+            yield from self._added(self.watch.counting(renumbered(key_pose, self.base)))
 
     def _begin(self) -> None:
         """Begin at the first key pose, which is the first that waits."""
@@ -241,6 +241,11 @@ class OnlineSlam:
             else:
                 self.estimator = Explorer(start, self.sensors, self.options)
             return
+        self._follow(start)
+
+    def _follow(self, start: StartPose) -> None:
+        """Follow the drive in the map from a start."""
+        self.watch.begun(start)
         self.estimator = self._follower(start)
 
     def _search_from(self, first: Trajectory, waiting: list[ArrivedKeyPose]) -> StartSearchState:
@@ -317,14 +322,20 @@ class OnlineSlam:
             raise ConfigError("the drive has not begun")
         before = estimator.best
         seen, used, refused = before.seen, before.used, before.fixes_refused
-        belief, best = estimator.add(self._with_fixes(estimator, key_pose)), estimator.best
+        key_pose = self._with_fixes(estimator, key_pose)
+        belief, best = estimator.add(key_pose), estimator.best
+        self.watch.followed(key_pose)
         if best.fixes_refused > refused:
             text = "a scan is left out: it contradicts odometry and readings"
             self._report(EventKind.SCAN_REFUSED, text)
         if key_pose.is_over_gap:
             self._counts.clear()
         self._count(best.seen - seen, best.used - used)
-        for each in self._watch.refuted(belief.known_sensors):
+        if better := self.watch.left_out(belief.known_sensors):
+            self.estimator = estimator = better.follower
+            belief = estimator.belief
+            self._report(EventKind.CALIBRATION_REFUTED, better.moved.note())
+        for each in self.watch.refuted(belief.known_sensors):
             self._report(EventKind.CALIBRATION_REFUTED, each.warning())
         wrong = self._wrong_over_gaps(estimator)
         if any(each.off_m > FAR_M for each in wrong) and isinstance(self._map, Surveyed):
@@ -418,7 +429,8 @@ class OnlineSlam:
         found = find_start(drive, self.known_map(), self.options, silent)
         self.stamp_ns = waiting[-1].stamp_ns
         if found.verdict is StartVerdict.UNIQUE:
-            self.search, self.estimator = None, self._follower(start_found(found, options))
+            self.search = None
+            self._follow(start_found(found, options))
             self._report(EventKind.START_FOUND, found.message)
             for each in waiting:
                 yield self._estimated(each)

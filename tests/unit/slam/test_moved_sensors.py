@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.moved_sensors import CalibrationWatch, sensor_to_leave_out
+from l2m_gtsam.slam.drive import KnownSensors, StartPose
+from l2m_gtsam.slam.moved_sensors import sensor_to_leave_out
+from l2m_gtsam.slam.online.branches import BranchedFollower
+from l2m_gtsam.slam.online.calibration_watch import CalibrationWatch
 
 MANY = {"a": 40.0, "b": 3000.0, "c": 900.0}
 
@@ -74,6 +76,10 @@ def test_where_nothing_is_refined_without_it_nothing_is_left_out() -> None:
     assert sensor_to_leave_out(MANY, without) is None
 
 
+def no_follower(_: StartPose) -> BranchedFollower:
+    raise AssertionError("nothing is followed again where no start is kept")
+
+
 def test_on_line_each_sensor_is_told_once() -> None:
     given = KnownSensors(
         ("a", "b"),
@@ -83,7 +89,7 @@ def test_on_line_each_sensor_is_told_once() -> None:
         np.full(2, 0.1),
         np.stack([0.01 * np.eye(15)] * 2),
     )
-    watch = CalibrationWatch(given)
+    watch = CalibrationWatch(given, no_follower)
     assert watch.refuted(given) == []
     # Nine sigmas of 0.1: chi-square 81 of 15, beyond 74.
     moved = replace(given, t=np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]]))
@@ -92,5 +98,6 @@ def test_on_line_each_sensor_is_told_once() -> None:
     assert found.change == pytest.approx(81.0)
     assert "b contradicts its calibration (chi-square 81 of 15)" in found.warning()
     assert watch.refuted(moved) == []
+    assert watch.left_out(moved) is None
     both = replace(moved, distortion=np.full((2, 12), 0.3))
     assert [each.sensor for each in watch.refuted(both)] == ["a"]
