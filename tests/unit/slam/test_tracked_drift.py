@@ -158,3 +158,18 @@ def test_a_drift_is_saved() -> None:
         strict=True,
     ):
         np.testing.assert_array_equal(mine, other)
+
+
+def test_a_steady_turning_is_a_walk_of_the_heading() -> None:
+    """Of its variance after 10 m, about the map's z axis; the step stays as odometry has it."""
+    way = way_of(8)
+    found, before = tracked(way, list(told(way, 8))), belief_at(way.truth[-2], TOLD_M)
+    plain = replace(way.key_poses[-1], steady=np.zeros(3))
+    turning = replace(plain, turning=np.array([0.0, 0.0, 0.01]))
+    without = found.without(turning, before)
+    assert not without.turning.any()
+    np.testing.assert_array_equal(without.p, plain.p)
+    R = before.pose.rotation().matrix() @ plain.R
+    more = R @ (without.covariance - plain.covariance)[:3, :3] @ R.T
+    expected = np.diag([0.0, 0.0, 0.01**2 * OVER_M * plain.length_m])
+    np.testing.assert_allclose(more, expected, rtol=0, atol=1e-12)
