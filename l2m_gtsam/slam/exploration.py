@@ -113,6 +113,7 @@ def explore(
     # One sensor's C and H are estimated in any case.
     is_held = options.calibration is CalibrationUse.FIXED and not has_one_sensor(drive)
     held = held_notes(drive) if is_held else ()
+    level = plane_hints(recording.trajectory, options.drift, is_stated=drive.steps.stated)
     explored = Explored(len(mapped.tiled.tiles), len(mapped.returns) / len(drive))
     result = replace(
         explored_result(result, explored),
@@ -129,7 +130,7 @@ def explore(
             ),
             *([] if mapped.noise is None else [noise_note(mapped.noise, drive)]),
         ),
-        hints=plane_hints(recording.trajectory, options.drift, is_stated=drive.steps.stated),
+        hints=(*level, *result.hints),
         bag=recording.source,
         explored=explored,
         gain=mapped.gain,

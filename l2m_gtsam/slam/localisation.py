@@ -153,7 +153,8 @@ def localised(
     result = localisation_result(drive, solution, by_scans, kept, decoys)
     held = () if refined else held_notes(drive)
     notes = (*notes, *held, *odometry.notes, *result.notes, *decoy_notes(len(maps), len(decoys)))
-    hints = plane_hints(recording.trajectory, options.drift, is_stated=drive.steps.stated)
+    level = plane_hints(recording.trajectory, options.drift, is_stated=drive.steps.stated)
+    hints = (*level, *result.hints)
     result = replace(result, notes=notes, hints=hints, bag=recording.source, start=search)
     return Localisation(result, solution)
 

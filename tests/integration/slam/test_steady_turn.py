@@ -1,5 +1,6 @@
 """Odometry that turns too far all along, as by a gyroscope's bias: found with the poses."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
+from l2m_gtsam.slam.result import turning_hints
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.slam.solution import DriveSolution
 from tests.drives.drawn import DrawnDrive, drawn_drive
@@ -74,6 +76,40 @@ def test_a_turning_that_is_no_variable_is_missed() -> None:
     solution = localise_drive(blind, dipole_world(seed), OPTIONS, silent)
     assert solution.turn is None
     assert nees(drawn, solution) > 2 * nees(drawn, localised(seed))
+    # Steps that may not turn so much hold the poses back.
+    assert 0.05 < hinted(solution) / turning(seed)[1] < 1.0
+    assert turning_hints(localised(seed)) == ()
+
+
+def hinted(solution: DriveSolution) -> float:
+    """Return by how much odometry is said to turn too far to the left, deg per metre."""
+    (told,) = turning_hints(solution)
+    found = re.search(r"turn by ([0-9.]+) deg per metre or more too far to the (left|right)", told)
+    assert found is not None
+    return float(found[1]) * (1 if found[2] == "left" else -1)
+
+
+def test_steps_that_may_turn_tell_by_how_much_they_do() -> None:
+    """To a fifth: stated as errors of 0.3 degrees per metre over 10 m, it is nearly followed."""
+    seed = max(SEEDS, key=lambda each: abs(turning(each)[1]))
+    drive = turning(seed)[0].drive
+    covariance = drive.steps.covariance.copy()
+    length = np.linalg.norm(drive.steps.p, axis=1)[:, None, None]
+    covariance[:, :3, :3] += np.deg2rad(0.3) ** 2 * 10 * length * np.eye(3)
+    loose = replace(drive, steps=replace(drive.steps, turning=None, covariance=covariance))
+    solution = localise_drive(loose, dipole_world(seed), OPTIONS, silent)
+    assert hinted(solution) == pytest.approx(turning(seed)[1], rel=0.2)
+
+
+def test_of_errors_of_steps_alone_nothing_is_told() -> None:
+    """Of five drives one in 70 would be, by chance."""
+    for seed in range(5):
+        rng, truth = np.random.default_rng(200 + seed), rounds(15)[np.arange(0, 300, 2)]
+        walk = DRIFT.model_copy(update={"steady_turn_deg_per_m": 0.0})
+        world = dipole_world(seed)
+        drawn = drawn_drive(world, random_sensors(seed, 2), truth, rng, EXACT, 0.2, 3, walk)
+        solution = localise_drive(drawn.drive, world, SlamOptions(drift=walk), silent)
+        assert turning_hints(solution) == ()
 
 
 def test_steps_without_the_turning_are_those_of_the_poses() -> None:
