@@ -39,6 +39,8 @@ LEGEND = {
     "chi2_per_dof": "mean square of whitened residuals; 1 is consistent",
     "scale": "longer: share by which all distances are longer than odometry has them, with its "
     "sigma; null where odometry's scale counts as right",
+    "turn": "degrees per metre by which odometry turns too far to the left all along, with its "
+    "sigma; absent where that was not estimated",
     "gain": "of a drive without a map: nats by which readings are likelier at the corrected poses "
     "than at odometry's, m rms between both, probability that odometry's are nearer to the truth; "
     "not shown: the poses are odometry's",
@@ -127,7 +129,7 @@ def write_slam(path: Path, record: LocalisationRecord) -> str:
     OutputError
         The file cannot be written.
     """
-    absent = {name for name in ("judgement", "gain", "hints") if not getattr(record, name)}
+    absent = {name for name in ("judgement", "gain", "hints", "turn") if not getattr(record, name)}
     file = _SlamFile("l2m-slam", 4, LEGEND, **fields_of(record, LocalisationRecord))
     found = report_id(json.loads(_SLAM.dump_json(file, exclude=absent)))
     _write(path, _SLAM.dump_json(replace(file, id=found), exclude=absent))

@@ -13,7 +13,7 @@ from l2m_gtsam.geometry import to_ros
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
 from l2m_gtsam.qa.metrics.evidence import sensor_evidence as asked_again
 from l2m_gtsam.qa.metrics.trajectory import localised_trajectory
-from l2m_gtsam.records.localisation import OdometryScale
+from l2m_gtsam.records.localisation import OdometryScale, OdometryTurn
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.slam.map_prediction import poses_in
 from l2m_gtsam.slam.pose_graph import drive_values, odometry_graph
@@ -126,7 +126,11 @@ def test_the_file_comes_back(tmp_path: Path) -> None:
     dead = replace(whole.sensors[0], use=nothing, fit=None, normalised=None, series=None)
     poses = (replace(whole.poses[0], covariance=None), *whole.poses[1:])
     less = replace(whole, sensors=(dead,), truth=None, refined=(), poses=poses)
-    for each in (whole, less, replace(whole, scale=OdometryScale(-0.011, 0.002))):
+    for each in (
+        whole,
+        less,
+        replace(whole, scale=OdometryScale(-0.011, 0.002), turn=OdometryTurn(0.2, 0.01)),
+    ):
         write_slam(path, each)
         back = read_slam(path)
         write_slam(tmp_path / "again.json", back)
