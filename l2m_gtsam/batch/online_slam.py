@@ -136,7 +136,7 @@ def slam_online(
         check_truth(truth, recording.trajectory, config.slam.max_pose_gap_s, str(given.truth))
     field_map = None if saved is None else _opened(saved, recording, config, progress)
     matcher, ignored = _matcher_or_why_not(given.bag, saved, config)
-    still = without_moving_fields(recording, calibration)
+    still = without_moving_fields(recording, calibration, config.slam.regressors)
     begun = _begun(still.calibration, config, field_map, matcher, out, resume=resume)
     if ignored is not None:
         begun.slam.report_scans_ignored(ignored)

@@ -205,7 +205,7 @@ def prepared(
         repaired = without_jumps(recording.trajectory, options.jumps)
     odometry = repaired.trajectory
     masked = mask_dropouts(replace(recording, trajectory=odometry))
-    still = without_moving_fields(masked.recording, calibration)
+    still = without_moving_fields(masked.recording, calibration, options.regressors)
     calibrated, left_out = usable_sensors(still.recording, still.calibration)
     readings = drive_readings(still.recording, calibrated, options)
     rows = np.union1d(key_pose_rows(odometry, options.key_poses), repaired.rows)

@@ -26,7 +26,9 @@ class StillDrive:
     calibration: CalibrationResult
 
 
-def without_moving_fields(recording: Recording, calibration: CalibrationResult) -> StillDrive:
+def without_moving_fields(
+    recording: Recording, calibration: CalibrationResult, options: ResampleOptions
+) -> StillDrive:
     """Take off what follows recorded numbers. The sigmas of these fields do not count.
 
     Parameters
@@ -35,6 +37,8 @@ def without_moving_fields(recording: Recording, calibration: CalibrationResult) 
         A drive with the numbers, by their names.
     calibration
         Of its sensors.
+    options
+        How far apart samples of a number may be.
     """
     numbers = {each.name: each for each in recording.scalars}
     entries = {
@@ -43,7 +47,7 @@ def without_moving_fields(recording: Recording, calibration: CalibrationResult) 
         if each.moving and all(own.name in numbers for own in each.moving)
     }
     series = tuple(
-        _still(each, entries[each.sensor], numbers) if each.sensor in entries else each
+        _still(each, entries[each.sensor], numbers, options) if each.sensor in entries else each
         for each in recording.series
     )
     sensors = tuple(
@@ -56,9 +60,10 @@ def _still(
     series: FieldSeries,
     sensor: SensorCalibration,
     numbers: dict[str, ScalarSeries],
+    options: ResampleOptions,
 ) -> FieldSeries:
     own = [numbers[each.name] for each in sensor.moving]
-    at = resampled(own, series.stamp_ns, ResampleOptions())
+    at = resampled(own, series.stamp_ns, options)
     field = without_moving(series.field, at.values, np.stack([each.h for each in sensor.moving]))
     field[~at.known] = np.nan
     return replace(series, field=field)

@@ -99,7 +99,7 @@ class OdometrySteps:
         own = np.stack(axes)
         return np.asarray(own[1:] @ own[:-1].transpose(0, 2, 1))
 
-    @property
+    @cached_property
     def up(self) -> FloatArray:
         """The third axis of the frame of the poses, in that of each step's end, (K - 1, 3)."""
         axes = [self.up_start]

@@ -8,6 +8,7 @@ from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.options import AnyQuaternion, Options
 from l2m_gtsam.recording.odometry_jumps import JumpOptions
+from l2m_gtsam.recording.regressors import ResampleOptions
 from l2m_gtsam.solve.robust import RobustOptions
 
 
@@ -264,6 +265,8 @@ class SlamOptions(Options):
 
     max_pose_gap_s: float = Field(default=0.5, gt=0)
     """Readings between two odometry poses further apart than this are dropped."""
+    regressors: ResampleOptions = ResampleOptions()
+    """How recorded numbers, whose fields are taken off, get to the times of readings."""
     key_poses: KeyPoseOptions = KeyPoseOptions()
     """Which poses are variables."""
     drift: DriftOptions = DriftOptions()

@@ -95,9 +95,9 @@ def turning_hints(solution: DriveSolution) -> tuple[str, ...]:
     off = steps.R.transpose(0, 2, 1) @ R[:-1].transpose(0, 2, 1) @ R[1:]
     too_far = -np.einsum("ni,ni->n", steps.up, Rotation.from_matrix(off).as_rotvec()).sum()
     walk = np.einsum("ni,nij,nj->", steps.up, steps.covariance[:, :3, :3], steps.up)
-    up, end = steps.up[-1], solution.pose_covariance[-1, :3, :3]
-    known = np.hypot(*np.sqrt([up @ end @ up, up @ solution.drive.start.covariance[:3, :3] @ up]))
-    if abs(too_far) < TURNS * max(np.sqrt(walk), known):
+    first, last = solution.drive.start.covariance[:3, :3], solution.pose_covariance[-1, :3, :3]
+    ends = steps.up_start @ first @ steps.up_start + steps.up[-1] @ last @ steps.up[-1]
+    if abs(too_far) < TURNS * np.sqrt(max(walk, ends)):
         return ()
     per_m = np.rad2deg(too_far) / steps.path[-1]
     text = (

@@ -1,7 +1,7 @@
 """Calibrations that a drive contradicts, as it is driven, and the sensor that is at fault.
 
 A sensor that was moved draws the poses with it. As off line (:mod:`l2m_gtsam.slam.moved_sensors`)
-the drive without it decides, here the way since its start, which is followed again.
+the drive without it decides, here the path since its start, which is followed again.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ class CalibrationWatch:
 
     Attributes
     ----------
-    told
+    reported
         Names of the sensors that were found to be contradicted.
     out
         Names of those of them whose readings do not count any more.
@@ -51,7 +51,7 @@ class CalibrationWatch:
     ) -> None:
         self._given, self._follower = given, follower
         self._roots = np.stack([stated_information_root(each) for each in given.covariance])
-        self.told: set[str] = set()
+        self.reported: set[str] = set()
         self.out: set[str] = set()
         self._start: StartPose | None = None
         self._key_poses: list[ArrivedKeyPose] = []
@@ -63,7 +63,8 @@ class CalibrationWatch:
 
     def followed(self, key_pose: ArrivedKeyPose) -> None:
         """Keep a key pose, unless those since the start are too many."""
-        self._key_poses.append(key_pose)
+        if self._start is not None:
+            self._key_poses.append(key_pose)
         if len(self._key_poses) > KEPT:
             self._start, self._key_poses = None, []
 
@@ -78,23 +79,23 @@ class CalibrationWatch:
         found = [
             MovedSensor(name, change)
             for name, change in self._changes(refined).items()
-            if change > LARGEST and name not in self.told
+            if change > LARGEST and name not in self.reported
         ]
-        self.told |= {each.sensor for each in found}
+        self.reported |= {each.sensor for each in found}
         return found
 
     def left_out(self, refined: KnownSensors) -> LeftOut | None:
         """Return the sensor without which all others hold, if the drive shows it now."""
-        changes = self._changes(refined)
+        start, changes = self._start, self._changes(refined)
         most = max(changes.values())
-        if self._start is None or most < AGAIN * self._tried:
+        if start is None or most < AGAIN * self._tried:
             return None
         self._tried = most
         followed = dict[str, BranchedFollower]()
 
         def without(sensor: str) -> dict[str, float]:
             try:
-                followed[sensor] = self._followed_without(sensor)
+                followed[sensor] = self._followed_without(sensor, start)
             except CalibrationError:  # the others do not place the vehicle
                 return {}
             left = self._changes(followed[sensor].belief.known_sensors)
@@ -103,7 +104,7 @@ class CalibrationWatch:
         moved = sensor_to_leave_out(changes, without)
         if moved is None:
             return None
-        self.told |= {moved.sensor}
+        self.reported |= {moved.sensor}
         self.out |= {moved.sensor}
         self._key_poses = [self.counting(each) for each in self._key_poses]
         return LeftOut(moved, followed[moved.sensor])
@@ -116,10 +117,8 @@ class CalibrationWatch:
         changes = dict(zip(self._given.names, squared.tolist(), strict=True))
         return {name: change for name, change in changes.items() if name not in self.out}
 
-    def _followed_without(self, sensor: str) -> BranchedFollower:
-        if self._start is None:
-            raise CalibrationError("the way since the start is not kept")
-        follower, number = self._follower(self._start), self._given.names.index(sensor)
+    def _followed_without(self, sensor: str, start: StartPose) -> BranchedFollower:
+        follower, number = self._follower(start), self._given.names.index(sensor)
         for each in self._key_poses:
             follower.add(each.without_sensor(number))
         return follower

@@ -377,8 +377,8 @@ class Intake:
         readings = self._placed(waiting, trajectory, rows)
         steps = odometry_steps(trajectory, rows, options.drift)
         if self._drift_axes is None:
-            steps, steady = steps.as_walk(options.drift.over_m), np.zeros(3)
-            turning = np.zeros(3)
+            steps = steps.as_walk(options.drift.over_m)
+            steady = turning = np.zeros(3)
         else:
             steps = steps.with_scale_as_drift(options.drift.over_m)
             share = steady_share(options.drift, is_stated=steps.stated)[0]

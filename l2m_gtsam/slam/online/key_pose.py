@@ -213,7 +213,7 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
             stated=False,
             fixed_axes=np.stack(shifts) if shifts and len(shifts) == len(steps) else None,
             steady=steady if steady.any() else None,
-            turning=np.column_stack([0.0 * turning, turning]) if turning.any() else None,
+            turning=np.outer(turning, [0.0, 1.0]) if turning.any() else None,
             up_start=up_start,
         ),
         readings=joined_readings([each.readings for each in key_poses]),

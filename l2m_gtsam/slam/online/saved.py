@@ -78,7 +78,7 @@ def saved_state(slam: OnlineSlam) -> SavedState:
         str(stamp): [each.kind.value, each.text]
         for stamp, each in slam.intake.state.suspect.items()
     }
-    facts["refuted"], facts["left_out"] = sorted(slam.watch.told), sorted(slam.watch.out)
+    facts["refuted"], facts["left_out"] = sorted(slam.watch.reported), sorted(slam.watch.out)
     if isinstance(slam.matcher, LoopMatcher):
         arrays |= named("loops", packed_loops(slam.matcher))
     estimator, search = slam.estimator, slam.search
@@ -133,7 +133,8 @@ def resumed_slam(
         if state.arrays["sensor.names"].tobytes() != names:
             raise ConfigError(OTHER)
         _refuse_other(slam, under("given", state.arrays))
-        if state.facts.get("options") != slam.options.model_dump(mode="json"):
+        # Options that a state of an older version does not name have their defaults.
+        if SlamOptions.model_validate(state.facts["options"]) != slam.options:
             raise ConfigError(OTHER)
         _resume(slam, state)
         unread = _unpacked_events(state.facts)
@@ -168,8 +169,8 @@ def _resume(slam: OnlineSlam, state: SavedState) -> None:
     arrays, facts = state.arrays, state.facts
     slam.intake.resume(_unpacked_intake(under("intake", arrays), facts["suspect"], slam.intake))
     slam.base, slam.stamp_ns = (int(each) for each in arrays["base"])
-    for told, key in ((slam.watch.told, "refuted"), (slam.watch.out, "left_out")):
-        told.update(set(facts.get(key, ())) & set(slam.sensors.names))  # older states do not say
+    for names, key in ((slam.watch.reported, "refuted"), (slam.watch.out, "left_out")):
+        names.update(set(facts.get(key, ())) & set(slam.sensors.names))  # older states do not say
     if isinstance(slam.matcher, LoopMatcher):
         resume_loops(slam.matcher, under("loops", arrays))
     stages: dict[str, Callable[[], None]] = {

@@ -49,14 +49,15 @@ class Way:
     def over(cls, steps: OdometrySteps, first: int, last: int) -> "Way":
         """Return the way between two key poses."""
         T, covariance, turning = gtsam.Pose3(), np.zeros((POSE, POSE)), np.zeros((POSE, 2))
-        up = steps.up if steps.turning is not None else None
+        turns = np.zeros((len(steps), 3, 2))
+        if steps.turning is not None:
+            turns = steps.up[:, :, None] * steps.turning[:, None]
         for k in range(first, last):
             step = gtsam.Pose3(gtsam.Rot3(steps.R[k]), steps.p[k])
             carried = step.inverse().AdjointMap()
             covariance = carried @ covariance @ carried.T + steps.covariance[k]
             turning = carried @ turning
-            if up is not None and steps.turning is not None:
-                turning[:3] += up[k][:, None] * steps.turning[k]
+            turning[:3] += turns[k]
             T = T.compose(step)
         steady = np.zeros((2, 3)) if steps.steady is None else steps.steady[first:last].sum(axis=0)
         return cls(T, covariance, steady, turning)

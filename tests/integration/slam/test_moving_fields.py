@@ -48,7 +48,7 @@ def test_poses_are_those_of_a_still_drive() -> None:
     assert [each.sensor for each in found.sensors] == [each.sensor for each in expected.sensors]
     assert found.calibration is not None
     assert found.calibration.sensors[0].moving == known.sensors[0].moving
-    still = without_moving_fields(recording, known)
+    still = without_moving_fields(recording, known, OPTIONS.regressors)
     on_line, plain_on_line = (
         driven_online(OnlineSlam(calibration, OPTIONS, WORLD), messages(each)).trajectory()
         for each, calibration in (
@@ -73,7 +73,7 @@ def test_readings_where_a_number_is_not_known_are_none() -> None:
     (number,), first = recording.scalars, recording.series[0]
     part = slice(0, len(number) // 2)
     half = replace(number, stamp_ns=number.stamp_ns[part], value=number.value[part])
-    still = without_moving_fields(replace(recording, scalars=(half,)), known)
+    still = without_moving_fields(replace(recording, scalars=(half,)), known, OPTIONS.regressors)
     inside = first.stamp_ns <= half.stamp_ns[-1]
     own = still.recording.series[0].field
     np.testing.assert_allclose(own[inside], driven()[0].recording.series[0].field[inside])

@@ -108,7 +108,9 @@ def of_old(slam: OnlineSlam) -> SavedState:
     (steady,) = (k for k in arrays if k.endswith("beginning.steady"))
     covariance = steady.replace("steady", "covariance")
     arrays |= {steady: arrays[steady][:6], covariance: arrays[covariance][:-2, :-2]}
-    return SavedState(arrays, state.facts)
+    options = {**state.facts["options"], "drift": dict(state.facts["options"]["drift"])}
+    options["drift"].pop("steady_turn_deg_per_m")
+    return SavedState(arrays, state.facts | {"options": options})
 
 
 # Of the messages. The field is learnt after 22 % of them.
