@@ -36,6 +36,10 @@ class DrawnDrive:
         """The true key poses."""
         return as_poses(self.R, self.p)
 
+    def reckoned_off(self, drive: Drive) -> float:
+        """Return by how much odometry of a drive ends off the true path, metres."""
+        return float(np.linalg.norm(drive.dead_reckoning()[-1].translation() - self.p[-1]))
+
 
 def drawn_drive(
     world: Field,
