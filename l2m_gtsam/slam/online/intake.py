@@ -1,4 +1,4 @@
-"""Odometry and readings as they come, made into key poses.
+"""Odometry, readings and scans as they come, made into key poses.
 
 A key pose is made as in a recording (:mod:`l2m_gtsam.slam.odometry`), from the poses and readings
 since the one before, after a delay in which late readings may come. What cannot be used is refused
@@ -7,13 +7,11 @@ and reported. What waits is bounded: of a parked vehicle every other pose and re
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from numbers import Integral
 from types import MappingProxyType
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Trajectory
-from l2m_gtsam.errors import InputError
 from l2m_gtsam.geometry import between
 from l2m_gtsam.recording.sync import at_poses, has_pose, interpolated, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
@@ -21,28 +19,18 @@ from l2m_gtsam.slam.drift import steady_share, steady_turn
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import Links
-from l2m_gtsam.slam.localisation import left_out, why_unusable
 from l2m_gtsam.slam.odometry import FixedStep, odometry_steps
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, ScanAtKeyPose
 from l2m_gtsam.slam.online.odometry_check import SuspectStep, suspect_step, velocity
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose, trajectory_of
+from l2m_gtsam.slam.online.reading_intake import ReadingIntake
 from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
-from l2m_gtsam.slam.online.stamp_order import Held, decided
+from l2m_gtsam.slam.online.stamp_order import NS, Held, decided, require_stamp, seconds_ahead
 from l2m_gtsam.slam.options import SlamOptions, StepAxes
 
 MOST_SCANS = 8
 MOST_POSES = 512  # that wait for a key pose
-# No magnetometer of a vehicle reads less or more: those in gauss seem to, or in nanotesla.
-READ_UT = (1.0, 2000.0)
-AHEAD_S = 5.0  # a reading or a scan further ahead of odometry has a wrong stamp
-NS = 1e-9
-SENSOR_TEXTS = {
-    EventKind.OUT_OF_ORDER: "has readings that are older than those before them: they are left out",
-    EventKind.SENSOR_BACK: "has readings again",
-    EventKind.SENSOR_STUCK: "repeats one value while the vehicle moves: it is left out",
-    EventKind.SENSOR_SILENT: "sends nothing",
-}
 
 
 @dataclass
@@ -104,25 +92,23 @@ class Intake:
     ) -> None:
         self._known, self._options, self._online = sensors, options, options.online
         self._drift_axes = drift_axes
-        self._index = {name: i for i, name in enumerate(sensors.names)}
-        self.state = IntakeState(sensors=[SensorBuffer() for _ in sensors.names])
+        self._readings = ReadingIntake(sensors.names, unusable)
+        self.state = IntakeState(sensors=self._readings.buffers)
         self._looked_at = 1
-        self._unusable, self._strangers = unusable, set[str]()
-        self._implausible = set[str]()  # sensors that were reported to read no field
         self._scans: list[Scan] = []
         self._held: OdometryPose | None = None  # ahead of the last, or older: the next one decides
         self._velocities = self.state.velocity, self.state.last_velocity  # before the last pose
-        self._ahead = set[str]()  # sensors that were reported to be ahead of odometry
         self._events: list[OnlineEvent] = []
 
     def events(self) -> list[OnlineEvent]:
         """Return what happened since the last call."""
-        found, self._events = self._events, []
+        found, self._events = [*self._events, *self._readings.events()], []
         return found
 
     def resume(self, state: IntakeState) -> None:
         """Go on from a state."""
         self.state, self._looked_at = state, 1
+        self._readings.buffers = state.sensors
         self._velocities = state.velocity, state.last_velocity
 
     def add_scan(self, scan: Scan) -> None:
@@ -139,11 +125,10 @@ class Intake:
 
     def _refuse_scans_ahead(self, last_ns: int) -> None:
         for scan in self._scans:
-            ahead = NS * (scan.stamp_ns - last_ns)
-            if ahead > AHEAD_S:
+            if ahead := seconds_ahead(scan.stamp_ns, last_ns):
                 text = f"a scan is stamped {ahead:.1f} s ahead of odometry: left out"
                 self._report(scan.stamp_ns, EventKind.SCAN_REFUSED, text)
-        self._scans = [each for each in self._scans if NS * (each.stamp_ns - last_ns) <= AHEAD_S]
+        self._scans = [each for each in self._scans if not seconds_ahead(each.stamp_ns, last_ns)]
 
     def add_odometry(self, pose: OdometryPose) -> None:
         """Take a pose; one that is no pose, or not later than the last, is refused.
@@ -224,50 +209,10 @@ class Intake:
             self._looked_at = len(poses) - 1
 
     def add_reading(self, stamp_ns: int, sensor: str, value: FloatArray) -> None:
-        """Take a reading in uT.
-
-        One that is not finite, no field in that unit, late, or of another sensor is left out.
-
-        Raises
-        ------
-        InputError
-            The stamp is no number of nanoseconds, or the reading is not of shape (3,).
-        """
-        require_stamp(stamp_ns)
-        number = self._index.get(sensor)
-        if number is None:
-            self._meet_stranger(stamp_ns, sensor)
-            return
-        own = np.array(value, dtype=np.float64)
-        if own.shape != (3,):
-            raise InputError(f"a reading of {sensor}: of shape {own.shape}; needed is (3,)")
-        if not np.isfinite(own).all():
-            return
-        strength = float(np.linalg.norm(own))
-        if not READ_UT[0] <= strength <= READ_UT[1]:
-            self._refuse_strength(stamp_ns, sensor, strength)
-            return
-        poses, buffer = self.state.poses, self.state.sensors[number]
-        if poses and stamp_ns > poses[-1].stamp_ns + AHEAD_S / NS:
-            if sensor not in self._ahead:
-                ahead = NS * (stamp_ns - poses[-1].stamp_ns)
-                text = f"a reading of {sensor} is stamped {ahead:.1f} s ahead of odometry: left out"
-                self._report(stamp_ns, EventKind.OUT_OF_ORDER, text)
-            self._ahead.add(sensor)
-            return
-        self._ahead.discard(sensor)
-        if self.state.number and stamp_ns <= poses[0].stamp_ns:
-            if not buffer.disordered:
-                text = f"{sensor} {SENSOR_TEXTS[EventKind.OUT_OF_ORDER]}"
-                self._report(stamp_ns, EventKind.OUT_OF_ORDER, text)
-            buffer.disordered = True
-            return
-        before_ns = buffer.last_ns
-        for kind in buffer.add(stamp_ns, own):
-            self._report(stamp_ns, kind, f"{sensor} {SENSOR_TEXTS[kind]}")
-        if buffer.last_ns < before_ns:
-            text = f"a reading of {sensor} is stamped ahead of those after it: left out"
-            self._report(before_ns, EventKind.OUT_OF_ORDER, text)
+        """Take a reading in uT, shape (3,); see ``ReadingIntake.add``."""
+        poses = self.state.poses
+        first_ns = poses[0].stamp_ns if self.state.number else None
+        self._readings.add(stamp_ns, sensor, value, first_ns, poses[-1].stamp_ns if poses else None)
 
     def key_poses(self, *, to_the_end: bool = False) -> Iterator[ArrivedKeyPose]:
         """Yield the key poses that can be made by now; at the end of a drive all of them."""
@@ -275,21 +220,6 @@ class Intake:
             self._settle(None)
         while (row := self._next_row(to_the_end)) is not None:
             yield self._made(row)
-
-    def _refuse_strength(self, stamp_ns: int, sensor: str, strength: float) -> None:
-        if sensor not in self._implausible:
-            self._implausible.add(sensor)
-            text = (
-                f"{sensor} reads {strength:.4g} where microtesla are wanted: is it in another "
-                "unit? Such readings are left out"
-            )
-            self._report(stamp_ns, EventKind.UNUSABLE, text)
-
-    def _meet_stranger(self, stamp_ns: int, sensor: str) -> None:
-        if sensor not in self._strangers and len(self._strangers) < MOST_POSES:
-            self._strangers.add(sensor)
-            text = left_out(sensor, self._unusable.get(sensor) or why_unusable(None))
-            self._report(stamp_ns, EventKind.UNUSABLE, text)
 
     def _check_step(self, before: OdometryPose, pose: OdometryPose) -> None:
         """Report a step over a gap, or one that the motion before does not explain."""
@@ -349,11 +279,10 @@ class Intake:
         self._scans = [each for each in self._scans if each.stamp_ns > stamp]
         suspect = state.suspect.pop(stamp, None)
         if number == 0:
-            for buffer in state.sensors:
-                buffer.take(stamp)
+            self._readings.take(stamp)
             state.first_R = poses[row].T.R
             return ArrivedKeyPose.first(stamp, Links.none())
-        waiting = self._taken(stamp)
+        waiting = self._readings.take(stamp)
         key_pose = recorded = self._between(poses, row, number, waiting)
         if suspect is not None:
             moved = replace(poses[row], T=suspect.end)
@@ -365,7 +294,9 @@ class Intake:
                 key_pose = replace(key_pose, recorded=recorded)
         if taken:
             key_pose = replace(key_pose, scans=scans_at(taken, trajectory_of(poses), row))
-        self._check_sensors(stamp, moved=key_pose.length_m >= self._options.key_poses.distance_m)
+        silent_s = self._online.silent_s + self._online.delay_s
+        has_moved = key_pose.length_m >= self._options.key_poses.distance_m
+        self._readings.check(stamp, silent_s, moved=has_moved)
         return key_pose
 
     def _between(
@@ -406,17 +337,6 @@ class Intake:
         back = self.state.first_R.T
         return FixedStep(back @ after.R @ before.R.T @ back.T, back @ (after.t - before.t))
 
-    def _taken(self, until_ns: int) -> Readings:
-        """Return the waiting readings up to a time, without poses."""
-        parts = [buffer.take(until_ns) for buffer in self.state.sensors]
-        sensor = np.repeat(np.arange(len(parts)), [len(stamps) for stamps, _ in parts])
-        stamps = np.concatenate([stamps for stamps, _ in parts])
-        field = np.concatenate([values for _, values in parts])
-        none = np.empty((len(stamps), 3))
-        return Readings(
-            self._known.names, sensor, stamps, np.empty((len(stamps), 3, 3)), none, field
-        )
-
     def _placed(self, waiting: Readings, trajectory: Trajectory, rows: IntArray) -> Readings:
         """Return readings thinned, at poses of odometry, those in gaps of it left out."""
         offset, options = self._known.offset, self._options
@@ -425,20 +345,8 @@ class Intake:
         taken = thinned_readings(there, trajectory, rows, options.key_poses.readings)
         return at_poses(taken, trajectory, offset)
 
-    def _check_sensors(self, stamp_ns: int, *, moved: bool) -> None:
-        silent_ns = round((self._online.silent_s + self._online.delay_s) / NS)
-        for name, buffer in zip(self._known.names, self.state.sensors, strict=True):
-            for kind in buffer.check(stamp_ns, silent_ns, moved=moved):
-                self._report(stamp_ns, kind, f"{name} {SENSOR_TEXTS[kind]}")
-
     def _report(self, stamp_ns: int, kind: EventKind, text: str) -> None:
         self._events.append(OnlineEvent(stamp_ns, kind, text))
-
-
-def require_stamp(stamp_ns: object) -> None:
-    """Raise an InputError for a time that is no number of nanoseconds."""
-    if not isinstance(stamp_ns, Integral):
-        raise InputError(f"stamp_ns: {stamp_ns!r}; needed are nanoseconds as an integer")
 
 
 def scans_at(scans: Sequence[Scan], trajectory: Trajectory, row: int) -> tuple[ScanAtKeyPose, ...]:

@@ -5,7 +5,6 @@ back when it is made. Nothing is kept that grows with the drive, but in an unkno
 key pose relative to its tile.
 """
 
-from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -29,6 +28,7 @@ from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.branches import Branch, BranchedFollower, GapDoubt
 from l2m_gtsam.slam.online.calibration_watch import CalibrationWatch
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
+from l2m_gtsam.slam.online.explained_readings import ExplainedReadings
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.intake import Intake
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
@@ -43,8 +43,6 @@ from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 
 MOST_WAITING = 2000  # key poses of a start search: of a vehicle that turns on the spot
 SILENT_START_M = 1.0  # path before the first readings of a start search: it adds drift alone
-LAST_KEY_POSES = 20  # over which it is counted how many readings the map explains,
-LEAST_READINGS = 40  # where these have so many
 WEAKLY_HELD = (
     "one sensor in an unknown field holds the path weakly: poses come to be better only where the "
     "vehicle returns; localise the recorded drive off line for the best, or give a map"
@@ -53,7 +51,6 @@ IMPOSSIBLE = (
     "readings put the vehicle further from odometry than its drift, as stated, can have: poses "
     "follow odometry until the field is learnt anew"
 )
-REFUSED, FITS = 0.4, 0.6  # share that is explained, below which it is reported, and above again
 Estimator = BranchedFollower | Explorer | OneFieldExplorer
 
 
@@ -167,8 +164,7 @@ class OnlineSlam:
         self.estimator: Estimator | None = None
         self.search: StartSearchState | None = None
         self.base, self.stamp_ns = 0, 0  # number of the first key pose, time of the last
-        self._counts: deque[tuple[int, int]] = deque(maxlen=LAST_KEY_POSES)
-        self._refused = False
+        self._explained = ExplainedReadings()
         self._events: list[OnlineEvent] = []
         self.watch = CalibrationWatch(self.sensors, self._follower)
 
@@ -329,8 +325,9 @@ class OnlineSlam:
             text = "a scan is left out: it contradicts odometry and readings"
             self._report(EventKind.SCAN_REFUSED, text)
         if key_pose.is_over_gap:
-            self._counts.clear()
-        self._count(best.seen - seen, best.used - used)
+            self._explained.forget()
+        if found := self._explained.add(best.seen - seen, best.used - used):
+            self._report(*found)
         if better := self.watch.left_out(belief.known_sensors):
             self.estimator = estimator = better.follower
             belief = estimator.belief
@@ -358,10 +355,9 @@ class OnlineSlam:
 
     def _wrong_over_gaps(self, estimator: BranchedFollower) -> list[GapDoubt]:
         """Return gaps whose step readings have just refuted, alone or with all it may have been."""
-        total, good = (sum(each) for each in zip(*self._counts, strict=True))
-        if not estimator.doubts or (total < LEAST_READINGS and len(self._counts) < LAST_KEY_POSES):
+        if not (estimator.doubts and self._explained.is_telling):
             return []
-        if good < REFUSED * total:
+        if self._explained.are_few:
             return list(estimator.doubts.values())
         decisions = estimator.decisions()
         for each, was_right in decisions:
@@ -401,23 +397,6 @@ class OnlineSlam:
         for text in found.refused:
             self._report(EventKind.SCAN_REFUSED, text)
         return replace(key_pose, links=joined_rows([key_pose.links, found.links]), scans=())
-
-    def _count(self, seen: int, used: int) -> None:
-        """Report when the map explains few of the last readings, and when it does again."""
-        self._counts.append((seen, used))
-        total, good = (sum(each) for each in zip(*self._counts, strict=True))
-        if total < LEAST_READINGS:
-            return
-        if good < REFUSED * total and not self._refused:
-            text = (
-                f"the map explains {good / total:.0%} of the last {total} readings: the vehicle is "
-                "elsewhere, or the place has changed; poses follow odometry"
-            )
-            self._report(EventKind.READINGS_REFUSED, text)
-            self._refused = True
-        elif good > FITS * total and self._refused:
-            self._report(EventKind.READINGS_FIT, "the map explains the readings again")
-            self._refused = False
 
     def _searched(self, search: StartSearchState, *, at_end: bool) -> Iterator[OnlinePose]:
         """Search for the start if the path is long enough; yield all key poses if it is found."""

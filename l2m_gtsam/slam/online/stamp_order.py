@@ -1,10 +1,16 @@
-"""Which of two stamps that do not follow each other is wrong, by the one after them.
+"""What stamps of messages say: which of two is wrong, by the one after them, and which is ahead.
 
 A message that is older than the last may be late, or the last may be stamped ahead; one that comes
 after a gap may be stamped ahead itself. It is held until the next one shows.
 """
 
 from enum import Enum, auto
+from numbers import Integral
+
+from l2m_gtsam.errors import InputError
+
+NS = 1e-9
+AHEAD_S = 5.0  # a reading or a scan further ahead of odometry has a wrong stamp
 
 
 class Held(Enum):
@@ -40,3 +46,15 @@ def decided(held_ns: int, next_ns: int | None, last_ns: int, before_ns: float) -
     if next_ns is not None and before_ns < held_ns < next_ns < last_ns:
         return Held.LAST_IS_AHEAD
     return Held.IS_LATE
+
+
+def require_stamp(stamp_ns: object) -> None:
+    """Raise an InputError for a time that is no number of nanoseconds."""
+    if not isinstance(stamp_ns, Integral):
+        raise InputError(f"stamp_ns: {stamp_ns!r}; needed are nanoseconds as an integer")
+
+
+def seconds_ahead(stamp_ns: int, odometry_ns: int | None) -> float:
+    """Return by how much a stamp is too far ahead of the last pose of odometry; 0 if it is not."""
+    ahead = 0.0 if odometry_ns is None else NS * (stamp_ns - odometry_ns)
+    return ahead if ahead > AHEAD_S else 0.0
