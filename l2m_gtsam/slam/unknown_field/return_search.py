@@ -147,24 +147,23 @@ class ReturnSearch:
         In nats, of the tiles that the vehicle was in since ``begun`` and before.
         """
         anchoring, _ = anchored(poses, self.prior)
-        again = set(anchoring.tile[self.begun :].tolist())
-        tiles = occupied_tiles(anchoring, readings, poses, self.drive.sensors, self.prior)
+        owner, again = anchoring.tile[readings.key_pose], np.unique(anchoring.tile[self.begun :])
+        visited = [
+            number
+            for number in again.tolist()
+            if len(visits_among(readings.key_pose[owner == number])) > 1
+        ]
+        shared = readings[np.flatnonzero(np.isin(owner, visited))]
         share = len(readings) / len(self.drive.readings)
-        return sum(
-            self._agreement(tile, readings.key_pose[tile.rows], share)
-            for tile in tiles
-            if tile.number in again
-        )
+        tiles = occupied_tiles(anchoring, shared, poses, self.drive.sensors, self.prior)
+        return sum(self._agreement(tile, shared.key_pose[tile.rows], share) for tile in tiles)
 
     def _agreement(self, tile: OccupiedTile, key_pose: IntArray, share: float) -> float:
         """Return by how much visits to one tile are likelier together."""
-        visits = visits_among(key_pose)
-        if len(visits) < 2:
-            return 0.0
         x, sensor = tile.placed.x, tile.placed.readings.sensor
         variance = share * (self.noise[sensor, None] ** 2 + tile.field.unresolved(x))
         seen = Seen(x, tile.placed.field(self.drive.sensors), variance, key_pose)
-        alone = [Remembered.of(tile.field, seen[rows]) for rows in visits]
+        alone = [Remembered.of(tile.field, seen[rows]) for rows in visits_among(key_pose)]
         return reduce(add, alone).evidence - sum(each.evidence for each in alone)
 
     @property
@@ -205,13 +204,25 @@ class Bending:
 
     def to(self, node: FloatArray) -> tuple[list[gtsam.Pose3], float]:
         """Return the likeliest path whose end is moved so in the map, and its cost in nats."""
+        still, along = self._solutions
+        delta = still
+        for step, own in zip(node.tolist(), along, strict=True):
+            delta = delta.add(own.scale(step))
+        poses = poses_in(self._values.retract(delta), self._last + 1)
+        return poses, self._linear.error(delta) - self._least
+
+    @cached_property
+    def _solutions(self) -> tuple[gtsam.VectorValues, list[gtsam.VectorValues]]:
+        """The path whose end stays, and by what it bends for each metre of its end."""
+        still = self._ending_at(np.zeros(3))
+        return still, [self._ending_at(axis).subtract(still) for axis in np.eye(3)]
+
+    def _ending_at(self, node: FloatArray) -> gtsam.VectorValues:
         exact = gtsam.noiseModel.Isotropic.Sigma(3, AT_NODE_M)
         bent = gtsam.GaussianFactorGraph()
         bent.push_back(self._linear)
         bent.add(gtsam.JacobianFactor(X(self._last), self._by_pose, node, exact))
-        delta = bent.optimize(self._ordering)
-        poses = poses_in(self._values.retract(delta), self._last + 1)
-        return poses, self._linear.error(delta) - self._least
+        return bent.optimize(self._ordering)
 
     @cached_property
     def _least(self) -> float:

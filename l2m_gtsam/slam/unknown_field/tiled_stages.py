@@ -49,7 +49,7 @@ STAGES = (
     (1.0, np.inf, TOLERANCE),
     (1.0, np.inf, TOLERANCE),
 )
-SEARCH_MODES = 60  # of a tile, for the search: with so much noise 200 tell no more
+FOLLOWED_MODES = 60  # of a tile meanwhile: with so much noise 200 tell no more
 PIECE_M = 30.0  # path length over which a drive is followed at once
 
 
@@ -151,7 +151,7 @@ class StagedDrive:
     def followed(self, initial: list[gtsam.Pose3], progress: Progress) -> list[gtsam.Pose3]:
         """Return the poses solved piece by piece, coarsely."""
         path, noise = self.drive.steps.path, FOLLOWED[0] * self.drive.sensors.noise
-        long_waves = coarser(self.prior, SEARCH_MODES)
+        long_waves = coarser(self.prior, FOLLOWED_MODES)
         poses, known, begun = initial, 0, 0
         for end in [*np.arange(PIECE_M, path[-1], PIECE_M), path[-1]]:
             progress("following the drive", float(begun / len(self.drive)))
@@ -171,13 +171,15 @@ class StagedDrive:
         solved from both with less of it, and that one is returned whose solution is likelier then.
         If both solutions are in one place there is nothing to choose.
         """
-        problem = TiledProblem(search.drive, self._divided, self.options, close=CLOSE)
+        in_long_waves = partial(self.division, prior=search.prior)
+        problem = TiledProblem(search.drive, in_long_waves, self.options, close=CLOSE)
         found = problem.solved(poses, search.drive.sensors, *FOLLOWED)
         if (start := search.likeliest(poses)) is poses:
             return found
         other = problem.solved(start, search.drive.sensors, *FOLLOWED)
         if not search.apart(found.poses, other.poses):
             return found
+        problem = TiledProblem(search.drive, self._divided, self.options, close=CLOSE)
         finer = replace(search, noise=JUDGED[0] * search.drive.sensors.noise)
 
         def density(each: TiledRound) -> float:

@@ -251,12 +251,16 @@ def anchor_tiles(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
     core
         Edge of a tile's core in metres.
     """
-    anchors, tile, axes = [0], np.zeros(len(p), dtype=np.int64), level_axes(R)
-    for k in range(1, len(p)):
-        at = np.array(anchors)
-        tile[k] = tile_about(p[k], axes[at], p[at], core)
-        if tile[k] == len(anchors):
-            anchors.append(k)
+    anchors, axes = list[int](), level_axes(R)
+    tile, nearest = np.zeros(len(p), dtype=np.int64), np.full(len(p), np.inf)
+    outside = np.arange(len(p))
+    while len(outside):
+        anchor = int(outside[0])
+        away = horizontal_distance(p[anchor:] - p[anchor], axes[anchor])
+        rows = anchor + np.flatnonzero(away < nearest[anchor:])
+        tile[rows], nearest[rows] = len(anchors), away[rows - anchor]
+        anchors.append(anchor)
+        outside = outside[nearest[outside] > core / 2]
     return Anchoring(np.array(anchors), tile)
 
 
@@ -272,10 +276,23 @@ def tile_about(p: FloatArray, axes: FloatArray, anchors: FloatArray, core: float
     core
         Of a tile in metres.
     """
-    away = np.einsum("bji,bj->bi", axes, p - anchors)[:, :2]
-    distance = np.abs(away).max(axis=1)
+    distance = horizontal_distance(p - anchors, axes)
     nearest = int(distance.argmin())
     return nearest if distance[nearest] <= core / 2 else len(anchors)
+
+
+def horizontal_distance(away: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return the larger of both horizontal components of vectors, shape (N,).
+
+    Parameters
+    ----------
+    away
+        In the map in metres, shape (N, 3).
+    axes
+        Level axes in the map, of all or of each, shape (3, 3) or (N, 3, 3).
+    """
+    level = np.einsum("...ji,...j->...i", axes, away)
+    return np.asarray(np.abs(level[:, :2]).max(axis=1))
 
 
 def level_axes(R: FloatArray) -> FloatArray:

@@ -19,11 +19,13 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.changed_visits import Remembered
 from l2m_gtsam.slam.unknown_field.return_search import (
+    AT_NODE_M,
     CLEAR,
     DEPTH_M,
     MOST_NODES,
     SIGMAS,
     STEPS,
+    Bending,
     ReturnSearch,
     nodes,
 )
@@ -109,6 +111,21 @@ def test_odometry_within_the_field_s_reach_is_not_searched(monkeypatch: pytest.M
     poses = made.drive.dead_reckoning()
     assert made.search.likeliest(poses) is poses
     assert not asked
+
+
+def test_a_path_bends_to_a_node_at_the_cost_that_its_end_s_covariance_says() -> None:
+    """The cost of a Gaussian's end x is x^T P^-1 x / 2, in the linear system of odometry."""
+    made = lap(3, share=0.15)
+    poses = made.drive.dead_reckoning()
+    bending = Bending(made.drive, poses, 0)
+    for node in np.random.default_rng(0).normal(size=(5, 3)):
+        bent, cost = bending.to(node)
+        expected = 0.5 * node @ np.linalg.solve(bending.covariance, node)
+        # A millimetre of freedom at the node, over sigmas of a decimetre and more.
+        assert cost == pytest.approx(expected, rel=1e-3)
+        np.testing.assert_allclose(
+            bent[-1].translation() - poses[-1].translation(), node, atol=2 * AT_NODE_M
+        )
 
 
 def test_known_poses_stay() -> None:

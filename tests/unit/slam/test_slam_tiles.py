@@ -20,6 +20,8 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     drive_prior,
     field_prior,
     larger,
+    level_axes,
+    tile_about,
 )
 from tests.drives.slam import calibrated, laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
@@ -60,6 +62,22 @@ def test_every_key_pose_lies_in_the_core_of_its_tile(seed: int, core: float) -> 
     assert np.abs(away[:, :2]).max() <= core / 2 + 1e-9
     assert np.array_equal(laid.tile[laid.anchor], np.arange(len(laid)))
     assert np.all(laid.anchor[laid.tile] <= np.arange(len(p)))  # a tile begins with its anchor
+
+
+@given(seed=st.integers(0, 1000), core=st.floats(1.0, 6.0))
+@settings(deadline=None, max_examples=30)
+def test_tiles_of_a_whole_path_are_those_that_key_pose_after_key_pose_has(
+    seed: int, core: float
+) -> None:
+    R, p = walk(seed)
+    axes, anchors, tiles = level_axes(R), list[int](), list[int]()
+    for k, place in enumerate(p):
+        number = tile_about(place, axes[anchors], p[anchors], core) if anchors else 0
+        anchors += [k] if number == len(anchors) else []
+        tiles.append(number)
+    laid = anchor_tiles(R, p, core)
+    assert laid.anchor.tolist() == anchors
+    assert laid.tile.tolist() == tiles
 
 
 def test_a_tile_is_come_to_again_after_the_vehicle_was_away() -> None:
