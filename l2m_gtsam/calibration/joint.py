@@ -53,6 +53,7 @@ from l2m_gtsam.solve.rank import Determinacy
 # Of each round whose weights may be the last; two of these at least are made, and each step
 # shortens what remains fourfold.
 POLISHING_STEPS = 2
+H_ROWS = slice(12, 15)  # of H among t, C and H
 OWN = np.arange(SENSOR)  # where a sensor that shares no error stands among its variables
 
 
@@ -142,12 +143,15 @@ class SensorSolution:
 
     def with_spread_of_H(self, spread: FloatArray) -> "SensorSolution":
         """Return the same where H varies by as much, uT^2, shape (3, 3), on its own."""
-        covariance, at = self.joint_covariance.copy(), slice(12, 15)
-        covariance[at, at] += spread
+        before, covariance = np.diag(self.joint_covariance), self.joint_covariance.copy()
+        # What is not determined stays so, without correlation.
+        known = np.flatnonzero(np.isfinite(before[H_ROWS]))
+        at = H_ROWS.start + known
+        covariance[np.ix_(at, at)] += spread[np.ix_(known, known)]
         root = self.shared_root
         if root is not None:  # others' rows have nothing of it: what two have in common stays
             scale = np.ones(len(root))
-            scale[at] = np.sqrt(np.diag(covariance)[at] / np.diag(self.joint_covariance)[at])
+            scale[at] = np.sqrt(np.diag(covariance)[at] / before[at])
             root = scale[:, None] * root
         wander = self.variances.get(ErrorCause.WANDER, np.zeros(3)).copy()
         wander[2] += np.trace(spread)
