@@ -76,7 +76,8 @@ def map_drive(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    lasting = StagedDrive(drive, prior, options, TiledDrive.lasting)
+    long_waves = coarser(prior, FOLLOWED_MODES)
+    lasting = StagedDrive(drive, prior, long_waves, options, TiledDrive.lasting)
     found = lasting.solved(initial, progress)
     if not finds_changes(found.solution.drive, found.solution.poses, prior):
         return found
@@ -84,7 +85,9 @@ def map_drive(
     def again(stage: str, done: float) -> None:
         progress(f"{stage}, with moved steel", done)
 
-    changed = replace(lasting, division=TiledDrive.renewed).solved(initial, again)
+    # In tiles of few waves many visits seem to find another field.
+    division = TiledDrive.renewed
+    changed = replace(lasting, followed_in=prior, division=division).solved(initial, again)
     used = found.solution.used | changed.solution.used
     return found if log_density(found, used) > log_density(changed, used) + CLEAR else changed
 
@@ -122,12 +125,15 @@ class StagedDrive:
     ----------
     drive, prior, options
         As of ``map_drive``.
+    followed_in
+        Prior of the tiles in which the drive is followed coarsely.
     division
         Divides the drive into tiles of a prior.
     """
 
     drive: Drive
     prior: FieldPrior
+    followed_in: FieldPrior
     options: SlamOptions
     division: Callable[..., TiledDrive]
 
@@ -172,8 +178,8 @@ class StagedDrive:
         solved from both with less of it, and that one is returned whose solution is likelier then.
         If both solutions are in one place there is nothing to choose.
         """
-        in_long_waves = partial(self.division, prior=search.prior)
-        problem = TiledProblem(search.drive, in_long_waves, self.options, close=CLOSE)
+        coarsely = partial(self.division, prior=self.followed_in)
+        problem = TiledProblem(search.drive, coarsely, self.options, close=CLOSE)
         found = problem.solved(poses, search.drive.sensors, *FOLLOWED)
         if (start := search.likeliest(poses)) is poses:
             return found

@@ -114,7 +114,7 @@ def two_places(monkeypatch: pytest.MonkeyPatch) -> TwoPlaces:
 
     monkeypatch.setattr(TiledProblem, "solved", as_they_are)
     monkeypatch.setattr(ReturnSearch, "density", density)
-    staged = StagedDrive(drive, prior, QUICK, TiledDrive.lasting)
+    staged = StagedDrive(drive, prior, prior, QUICK, TiledDrive.lasting)
     return TwoPlaces(staged, monkeypatch)
 
 
