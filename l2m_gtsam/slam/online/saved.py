@@ -47,7 +47,8 @@ from l2m_gtsam.slam.online.packing import (
 )
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanMatcher
 from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
-from l2m_gtsam.slam.online.session import OnlineSlam, StartSearchState
+from l2m_gtsam.slam.online.session import OnlineSlam
+from l2m_gtsam.slam.online.start_search import StartSearchState
 from l2m_gtsam.slam.online.tracked_drift import TrackedDrift
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExplorerState, MarginalizedPose

@@ -34,6 +34,7 @@ from l2m_gtsam.slam.online.intake import Intake
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose, trajectory_of
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanLinks, ScanMatcher
+from l2m_gtsam.slam.online.start_search import StartSearchState
 from l2m_gtsam.slam.online.step_doubts import StepDecision
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, refuse_offline_only
 from l2m_gtsam.slam.slips import FAR_M
@@ -41,8 +42,6 @@ from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 
-MOST_WAITING = 2000  # key poses of a start search: of a vehicle that turns on the spot
-SILENT_START_M = 1.0  # path before the first readings of a start search: it adds drift alone
 WEAKLY_HELD = (
     "one sensor in an unknown field holds the path weakly: poses come to be better only where the "
     "vehicle returns; localise the recorded drive off line for the best, or give a map"
@@ -81,36 +80,6 @@ class OnlinePose:
         # A part of the belief's covariance would keep all of it for as long as the pose is kept.
         covariance = belief.pose_covariance.copy()
         return cls(stamp_ns, as_transform(belief.pose), covariance, belief.known_sensors)
-
-
-@dataclass
-class StartSearchState:
-    """A drive whose start is searched for.
-
-    Attributes
-    ----------
-    first
-        Its first pose by odometry, of which the vertical counts.
-    waiting
-        Its key poses so far.
-    window_m
-        Path in metres of the next attempt.
-    """
-
-    first: StartPose
-    waiting: list[ArrivedKeyPose]
-    window_m: float
-
-    @property
-    def path_m(self) -> float:
-        """Path of the key poses so far, metres."""
-        return sum(each.length_m for each in self.waiting)
-
-    def is_silent(self) -> bool:
-        """Return whether no sensor has sent for so long that the search begins anew."""
-        if any(len(each.readings) for each in self.waiting):
-            return False
-        return self.path_m > SILENT_START_M or len(self.waiting) > MOST_WAITING
 
 
 class OnlineSlam:
@@ -401,8 +370,7 @@ class OnlineSlam:
     def _searched(self, search: StartSearchState, *, at_end: bool) -> Iterator[OnlinePose]:
         """Search for the start if the path is long enough; yield all key poses if it is found."""
         waiting, options = search.waiting, self.options.start
-        full = search.path_m >= search.window_m or len(waiting) > MOST_WAITING
-        if len(waiting) < 2 or not (full or at_end):
+        if not search.is_due(at_end=at_end):
             return
         drive = drive_of(waiting, search.first, self.sensors)
         found = find_start(drive, self.known_map(), self.options, silent)
@@ -416,7 +384,7 @@ class OnlineSlam:
             return
         self._report(EventKind.START_OPEN, found.message)
         search.window_m *= GROWTH
-        if search.window_m > options.search.longest_m or len(waiting) > MOST_WAITING:
+        if search.window_m > options.search.longest_m or search.is_full:
             # Odometry's errors would blur more: begin anew from here, which bounds the memory, too.
             self._begin_search(waiting[-1])
 

@@ -22,8 +22,11 @@ def test_few_explained_readings_are_reported_once_and_their_end_too() -> None:
 
 def test_key_poses_without_readings_tell_in_the_end() -> None:
     explained = ExplainedReadings()
-    told = [explained.add(0, 0) or explained.is_telling for _ in range(LAST_KEY_POSES)]
-    assert told == [False] * (LAST_KEY_POSES - 1) + [True]
+    telling = []
+    for _ in range(LAST_KEY_POSES):
+        assert explained.add(0, 0) is None
+        telling.append(explained.is_telling)
+    assert telling == [False] * (LAST_KEY_POSES - 1) + [True]
     assert not explained.are_few  # nothing was to be explained
     explained.forget()
     assert not explained.is_telling
