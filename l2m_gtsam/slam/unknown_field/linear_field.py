@@ -4,9 +4,12 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
+from scipy.spatial import cKDTree
 
 from l2m_factors import ComplexityPenalty
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.solution import REJECTED_WEIGHT
+from l2m_gtsam.solve.robust import SEEDS
 
 AXES = 3
 REWEIGHTINGS = 15
@@ -42,6 +45,34 @@ class LinearField(ABC):
         Near each other it is the same error, of which n readings say no more than one. With n
         times the variance each they say as little, where readings count as independent.
         """
+
+    @property
+    @abstractmethod
+    def half_wave(self) -> float:
+        """Half of the shortest wave that it holds, metres; 0 where the others count as noise."""
+
+    def trusted(self, points: FloatArray, trust: FloatArray) -> FloatArray:
+        """Return the weights of readings, 0 beside several of weight 0, shape (N,).
+
+        Steel that is nearer than the waves are short makes a field that they do not hold. On the
+        flank of such a place a reading may pass for noise, but all of them pull the poses.
+
+        Parameters
+        ----------
+        points
+            Readings in the anchor's frame in metres, shape (N, 3).
+        trust
+            Weight of each by itself, shape (N,).
+        """
+        wrong = points[trust <= REJECTED_WEIGHT]
+        if self.half_wave == 0 or len(wrong) < SEEDS:
+            return trust
+        among = cKDTree(wrong)
+        several = among.query_ball_point(wrong, self.half_wave, return_length=True) >= SEEDS
+        if not several.any():
+            return trust
+        away, _ = cKDTree(wrong[several]).query(points)
+        return np.where(away < self.half_wave, 0.0, trust)
 
     def robust_weights(
         self, points: FloatArray, field: FloatArray, variance: FloatArray

@@ -158,6 +158,8 @@ class TiledProblem:
         robust = self._options.robust
         r2 = predicted.squared(noise)
         weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
+        if np.isinf(mu):  # before, poses may be wrong where readings are rejected
+            weights = tiled.trusted(weights)
         penalties = tiled.penalties(noise, weights, predicted.prediction.squared(own))
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         fixed = None if self._free else self._drive.sensors.fixed()

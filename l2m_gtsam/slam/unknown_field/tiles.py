@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_factors import KeyPoseReadings
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import UNIFORM_SIGMA, Basis
 from l2m_gtsam.maps.harmonic.family import Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
@@ -20,7 +20,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
     resolution_of,
     surveyed_area,
 )
-from l2m_gtsam.maps.training import cubes_of, merged, training_set
+from l2m_gtsam.maps.training import TrainingSet, cubes_of, merged, training_set
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
 from l2m_gtsam.slam.options import MOST_WAVES, TileOptions
@@ -33,6 +33,7 @@ from l2m_gtsam.slam.unknown_field.read_path import path_with_readings
 WIDER = 10.0
 
 ALONG_AXES = np.array([0.5, 0.5, 1.0])  # variance of waves, in that of their vertical part
+EXTREME = 6.0  # times the median deviation from the median field
 GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
 
 
@@ -89,14 +90,35 @@ def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> 
     readings = merged(training_set(points, field), defaults.merge, defaults.independent)
     hyperparameters = options.hyperparameters
     if hyperparameters is None:
-        learning = LearningOptions(modes=options.modes)
-        tiling, share = defaults.tiling, defaults.mode_share
-        learnt = learn(readings, NO_SOURCES, tiling, share, learning, maximise)
-        hyperparameters = learnt.hyperparameters
+        hyperparameters = learnt_hyperparameters(readings, options.modes)
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
     wanted = resolution_of(hyperparameters, density, defaults.mode_share)
     kept = wanted.within(options.modes, options.edge)
     return FieldPrior(hyperparameters, kept, options)
+
+
+def learnt_hyperparameters(readings: TrainingSet, modes: int) -> Hyperparameters:
+    """Return strength and depth of the sources, in windows of so many modes.
+
+    One prior holds for the whole drive. A sensor that passes steel at arm's length reads tens of
+    times what it reads elsewhere. Sources that make this likely are next to the sensors: the depth
+    of the stronger side ends on its bound, and nearly all of the field is in waves that no tile
+    holds. Such readings are left out then.
+    """
+    defaults, learning = HarmonicOptions(), LearningOptions(modes=modes)
+    tiling, share = defaults.tiling, defaults.mode_share
+    learnt = learn(readings, NO_SOURCES, tiling, share, learning, maximise)
+    known, usual = learnt.hyperparameters, np.flatnonzero(is_usual(readings.field))
+    stronger = "floor" if known.floor_scale >= known.ceiling_scale else "ceiling"
+    if len(usual) < len(readings) and f"{stronger}_depth" in learnt.at_bound:
+        learnt = learn(readings[usual], NO_SOURCES, tiling, share, learning, maximise)
+    return learnt.hyperparameters
+
+
+def is_usual(field: FloatArray) -> BoolArray:
+    """Return which of N readings are not ``EXTREME``; ``field`` in uT, shape (N, 3)."""
+    away = np.linalg.norm(field - np.median(field, axis=0), axis=1)
+    return np.asarray(away <= EXTREME * np.median(away))
 
 
 def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) -> FieldPrior:
@@ -166,6 +188,11 @@ class WaveTile(LinearField):
     ) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
         return self.basis.field_and_gradient(points, self.scale * weights)
+
+    @property
+    def half_wave(self) -> float:
+        """Half of the shortest wave of floor and ceiling, metres."""
+        return np.pi / max(self.prior.resolution.floor, self.prior.resolution.ceiling)
 
     def unresolved(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis of unresolved waves, uT^2, shape (N, 3)."""

@@ -87,6 +87,11 @@ class WholeField(LinearField):
         """Return the derivative of a scalar by points (N, 3), of one by features (N, 3, m)."""
         return self.basis.by_points(points, by_features * self.scale)
 
+    @property
+    def half_wave(self) -> float:
+        """0: what its waves do not hold is learnt with the noise."""
+        return 0.0
+
     def unresolved(self, points: FloatArray) -> FloatArray:
         """Return none, shape (N, 3): what they do not hold is learnt with the noise."""
         return np.zeros((len(points), 3))

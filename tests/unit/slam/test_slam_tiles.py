@@ -23,6 +23,8 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     level_axes,
     tile_about,
 )
+from tests.drives.exploring import COARSE
+from tests.drives.moved_steel import moved_steel
 from tests.drives.slam import calibrated, laps, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -126,6 +128,32 @@ def test_the_likely_weights_predict_what_was_not_read() -> None:
     error = tile.field_and_gradient(held, weights)[0] - world.field_and_gradient(held)[0]
     assert np.sqrt(np.mean(error**2)) < 2 * noise
     assert np.std(world.field_and_gradient(held)[0], axis=0).max() > 5 * noise
+
+
+def test_beside_steel_that_waves_do_not_hold_no_reading_counts() -> None:
+    tile = WaveTile.about(PRIOR, np.eye(3), places(0))
+    x = np.linspace(-1.5, 1.5, 61)
+    points, trust = np.column_stack([x, np.zeros((61, 2))]), np.where(np.abs(x) < 0.08, 0.0, 0.5)
+    expected = np.where(np.abs(x) < tile.half_wave + 0.051, 0.0, 0.5)  # rejected are 5 cm away
+    np.testing.assert_array_equal(tile.trusted(points, trust), expected)
+
+
+@pytest.mark.parametrize("apart", [1, 20])
+def test_two_wrong_readings_or_some_far_apart_are_no_steel(apart: int) -> None:
+    tile = WaveTile.about(PRIOR, np.eye(3), places(0))
+    points = np.column_stack([np.linspace(-1.5, 1.5, 61), np.zeros((61, 2))])
+    trust = np.ones(61)
+    trust[[20, 20 + apart] if apart == 1 else [0, apart, 2 * apart, 3 * apart]] = 0.0
+    np.testing.assert_array_equal(tile.trusted(points, trust), trust)
+
+
+def test_a_prior_is_not_that_of_steel_at_arms_length() -> None:
+    made = moved_steel(5)  # a sensor passes the pallet at 0.28 m
+    options = SlamOptions.model_validate({"key_poses": COARSE})
+    drive, _ = prepared(made.still.recording, calibrated(made.sensors), options)
+    learnt = drive_prior(drive, drive.dead_reckoning(), TileOptions()).hyperparameters
+    # Most sources are 0.9 to 1.6 m below the sensors.
+    assert 0.5 < learnt.floor_depth < 2.0
 
 
 def test_waves_stay_within_their_number() -> None:
