@@ -14,6 +14,7 @@ from l2m_gtsam.solve.robust import SEEDS
 AXES = 3
 REWEIGHTINGS = 15
 SIDE_M = 1e-3  # of a finite difference
+SHARE = 0.25  # of the readings of a place, beyond which rejected ones are no spikes
 LARGE = 2.0  # length of a whitened residual beyond which a reading is downweighted
 
 
@@ -52,7 +53,7 @@ class LinearField(ABC):
         """Half of the shortest wave that it holds, metres; 0 where the others count as noise."""
 
     def trusted(self, points: FloatArray, trust: FloatArray) -> FloatArray:
-        """Return the weights of readings, 0 beside several of weight 0, shape (N,).
+        """Return the weights of readings, 0 where many others have weight 0, shape (N,).
 
         Steel that is nearer than the waves are short makes a field that they do not hold. On the
         flank of such a place a reading may pass for noise, but all of them pull the poses.
@@ -67,11 +68,14 @@ class LinearField(ABC):
         wrong = points[trust <= REJECTED_WEIGHT]
         if self.half_wave == 0 or len(wrong) < SEEDS:
             return trust
-        among = cKDTree(wrong)
-        several = among.query_ball_point(wrong, self.half_wave, return_length=True) >= SEEDS
-        if not several.any():
+        several, there = (
+            cKDTree(each).query_ball_point(wrong, self.half_wave, return_length=True)
+            for each in (wrong, points)
+        )
+        steel = (several >= SEEDS) & (several >= SHARE * there)
+        if not steel.any():
             return trust
-        away, _ = cKDTree(wrong[several]).query(points)
+        away, _ = cKDTree(wrong[steel]).query(points)
         return np.where(away < self.half_wave, 0.0, trust)
 
     def robust_weights(

@@ -133,8 +133,8 @@ def test_the_likely_weights_predict_what_was_not_read() -> None:
 def test_beside_steel_that_waves_do_not_hold_no_reading_counts() -> None:
     tile = WaveTile.about(PRIOR, np.eye(3), places(0))
     x = np.linspace(-1.5, 1.5, 61)
-    points, trust = np.column_stack([x, np.zeros((61, 2))]), np.where(np.abs(x) < 0.08, 0.0, 0.5)
-    expected = np.where(np.abs(x) < tile.half_wave + 0.051, 0.0, 0.5)  # rejected are 5 cm away
+    points, trust = np.column_stack([x, np.zeros((61, 2))]), np.where(np.abs(x) < 0.32, 0.0, 0.5)
+    expected = np.where(np.abs(x) < tile.half_wave + 0.3, 0.0, 0.5)
     np.testing.assert_array_equal(tile.trusted(points, trust), expected)
 
 
@@ -144,6 +144,15 @@ def test_two_wrong_readings_or_some_far_apart_are_no_steel(apart: int) -> None:
     points = np.column_stack([np.linspace(-1.5, 1.5, 61), np.zeros((61, 2))])
     trust = np.ones(61)
     trust[[20, 20 + apart] if apart == 1 else [0, apart, 2 * apart, 3 * apart]] = 0.0
+    np.testing.assert_array_equal(tile.trusted(points, trust), trust)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_spikes_among_many_readings_are_no_steel(seed: int) -> None:
+    tile = WaveTile.about(PRIOR, np.eye(3), places(0))
+    rng = np.random.default_rng(seed)
+    points, trust = rng.uniform(-1.5, 1.5, (3000, 3)), np.ones(3000)
+    trust[rng.random(3000) < 0.08] = 0.0  # some 60 of 800 in a half wave about each
     np.testing.assert_array_equal(tile.trusted(points, trust), trust)
 
 
