@@ -6,7 +6,7 @@ given the weights has their derivatives, in a factor of few rows. With all of it
 descent took twice the time; with all of it in a linear one poses ended 0.007 sigmas off.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,6 +19,7 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.solve.linear_algebra import correlation_factor, triangular_information_root
 
 ROUNDING = 1e-12  # of a correlation
+ROWS = 256  # of a covariance that are updated at once
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,15 @@ class Conditioned:
 
 
 def conditioned(
-    P: FloatArray, s: IntArray, shift: FloatArray, after: FloatArray, cross: FloatArray
+    P: FloatArray,
+    s: IntArray,
+    r: IntArray,
+    shift: FloatArray,
+    after: FloatArray,
+    cross: FloatArray,
+    into: FloatArray,
 ) -> Conditioned:
-    """Propagate an update of k components of a Gaussian to the r others, in their order.
+    """Propagate an update of k components of a Gaussian to r others.
 
     Given the first, the others are independent of the measurements: the conditional p(others |
     first) stays, as in the Rauch-Tung-Striebel smoother.
@@ -51,17 +58,18 @@ def conditioned(
     Parameters
     ----------
     P
-        Covariance before, shape (k + r, k + r).
-    s
-        Updated components, shape (k,).
+        Covariance before, shape (n, n).
+    s, r
+        Updated components, and the others that are asked for, shapes (k,) and (r,).
     shift
         Change of their mean, shape (k,).
     after
         Their covariance afterwards, shape (k, k).
     cross
         Their covariance with all that is estimated afterwards, shape (k, q).
+    into
+        Where the covariance of the others is written, shape (r, r).
     """
-    r = np.setdiff1d(np.arange(len(P)), s)
     sigma = np.sqrt(np.diag(P)[s])
     lower = correlation_factor(P[np.ix_(s, s)], ROUNDING)
 
@@ -71,9 +79,14 @@ def conditioned(
 
     B = whitened(P[np.ix_(s, r)])
     less = np.eye(len(s)) - whitened(whitened(after).T)
-    left = P[np.ix_(r, r)] - B.T @ (0.5 * (less + less.T) @ B)
+    removed = 0.5 * (less + less.T) @ B
+    # Few rows at once, and from the diagonal on: beside it nothing of its size is needed.
+    for first in range(0, len(r), ROWS):
+        own, onward = slice(first, first + ROWS), slice(first, None)
+        left = P[np.ix_(r[own], r[onward])] - B[:, own].T @ removed[:, onward]
+        into[own, onward], into[onward, own] = left, left.T
     carried = B.T @ whitened(np.column_stack([shift, cross]))
-    return Conditioned(carried[:, 0], 0.5 * (left + left.T), carried[:, 1:])
+    return Conditioned(carried[:, 0], into, carried[:, 1:])
 
 
 @dataclass(frozen=True)
@@ -108,32 +121,39 @@ class JointGaussian:
         at, sizes = self.columns(keys), {key: self.sizes[key] for key in keys}
         return JointGaussian(part_of(self.values, keys), sizes, self.covariance[np.ix_(at, at)])
 
-    def updated(self, after: "JointGaussian") -> "JointGaussian":
+    def updated(self, after: "JointGaussian", let_go: Collection[int] = ()) -> "JointGaussian":
         """Return the Gaussian after an update of some variables that adds others.
 
         Parameters
         ----------
         after
             Joint posterior of the updated and the new variables.
+        let_go
+            Variables that are marginalised afterwards.
         """
+        kept = after.marginal([key for key in after.sizes if key not in let_go])
         shared = {key: size for key, size in self.sizes.items() if key in after.sizes}
-        rest = {key: size for key, size in self.sizes.items() if key not in after.sizes}
+        others = (key for key in self.sizes if key not in after.sizes and key not in let_go)
+        rest = {key: self.sizes[key] for key in others}
         s, now = self.columns(shared), after.columns(shared)
         shift = local(part_of(self.values, list(shared)), after.values, shared)
         # A right perturbation at the posterior pose, expressed at the prior pose.
         was = gtsam.Pose3.LogmapDerivative
         cross = turned(after.covariance[now], shared, shift, was)
         own = turned(cross[:, now].T, shared, shift, was)
-        found = conditioned(self.covariance, s, shift, own, cross)
+        r, last = self.columns(rest), slice(sum(rest.values()), None)
+        covariance = np.empty((last.start + len(kept.covariance),) * 2)
+        left, across = covariance[: last.start, : last.start], covariance[: last.start, last]
+        cross = cross[:, after.columns(kept.sizes)]
+        found = conditioned(self.covariance, s, r, shift, own, cross, left)
+        across[:] = found.cross
         moves = gtsam.Pose3.ExpmapDerivative
-        left = turned(
-            turned(found.covariance, rest, found.shift, moves).T, rest, found.shift, moves
-        )
-        across = turned(found.cross, rest, found.shift, moves)
+        for rows in (left, left.T, across):
+            turn(rows, rest, found.shift, moves)
+        covariance[last, : last.start], covariance[last, last] = across.T, kept.covariance
         values = retracted(part_of(self.values, list(rest)), rest, found.shift)
-        values.insert(after.values)
-        covariance = np.block([[left, across], [across.T, after.covariance]])
-        return JointGaussian(values, {**rest, **after.sizes}, covariance)
+        values.insert(kept.values)
+        return JointGaussian(values, {**rest, **kept.sizes}, covariance)
 
 
 def part_of(values: gtsam.Values, keys: Sequence[int]) -> gtsam.Values:
@@ -165,9 +185,19 @@ def turned(
 ) -> FloatArray:
     """Return rows (n, q) of n components; those of poses are multiplied by a derivative."""
     found = rows.copy()
-    for own in poses_among(sizes):
-        found[own] = derivative(shift[own]) @ rows[own]
+    turn(found, sizes, shift, derivative)
     return found
+
+
+def turn(
+    rows: FloatArray,
+    sizes: Mapping[int, int],
+    shift: FloatArray,
+    derivative: Callable[[FloatArray], FloatArray],
+) -> None:
+    """Multiply those of rows (n, q) that are of poses by a derivative, in place."""
+    for own in poses_among(sizes):
+        rows[own] = derivative(shift[own]) @ rows[own]
 
 
 def poses_among(sizes: Mapping[int, int]) -> list[slice]:

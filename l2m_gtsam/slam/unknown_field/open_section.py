@@ -169,7 +169,10 @@ class OpenSection:
 
     def closed(self) -> Generator[None, None, FieldMemory]:
         """Return the memory updated by the section; yields between pieces of the work."""
-        known = self._memory.known.updated((yield from self._remembered()))
+        posterior = yield from self._remembered()
+        anchors = {X(tile.anchor) for tile in self._tiles}
+        let_go = {X(self._first)} - anchors - {X(self._last)}
+        known = self._memory.known.updated(posterior, let_go)
         yield
         tiles = list(self._tiles)
         for each in self._counted:
@@ -177,9 +180,7 @@ class OpenSection:
             tiles[tile.number] = replace(
                 tile, past_information=tile.past_information + each.information()
             )
-        let_go = {X(self._first)} - {X(tile.anchor) for tile in tiles} - {X(self._last)}
-        kept = [key for key in known.sizes if key not in let_go]
-        return FieldMemory(known.marginal(kept), tuple(tiles))
+        return FieldMemory(known, tuple(tiles))
 
     def _remembered(self) -> Generator[None, None, JointGaussian]:
         """Return the section's posterior, of which the memory learns nothing twice.

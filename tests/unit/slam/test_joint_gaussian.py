@@ -1,5 +1,7 @@
 """A dense Gaussian over variables: what is learnt of some is carried over to the others."""
 
+import tracemalloc
+
 import gtsam
 import numpy as np
 import pytest
@@ -42,7 +44,7 @@ def test_others_follow_as_if_all_had_been_solved_together(
     posterior = np.linalg.inv(np.linalg.inv(P) + J.T @ J)
     mean = posterior @ J.T @ y
     after = np.asarray(posterior[np.ix_(s, s)])
-    found = conditioned(P, s, mean[s], after, after)
+    found = conditioned(P, s, r, mean[s], after, after, np.empty((others, others)))
     np.testing.assert_allclose(found.shift, mean[r], atol=ROUNDING)
     np.testing.assert_allclose(found.covariance, posterior[np.ix_(r, r)], atol=ROUNDING)
     np.testing.assert_allclose(found.cross, posterior[np.ix_(r, s)], atol=ROUNDING)
@@ -120,6 +122,35 @@ def test_what_some_variables_tell_the_others_is_what_all_together_say(
     scale = np.sqrt(np.diag(whole.covariance))
     wrong = (after.covariance - whole.covariance) / np.outer(scale, scale)
     assert np.abs(wrong).max() < (1e-3 if step < 1e-3 else 0.2)
+
+
+@pytest.mark.parametrize("let_go", [(), (X(7),), (X(0),), (M(0), X(3))])
+def test_what_is_let_go_is_marginalised(let_go: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(6)
+    before = known(rng, 0.01)
+    part = solved(seen(rng, before.values, 0.1), before.marginal([X(3), M(1), X(7)]))[1]
+    found, whole = before.updated(part, let_go), before.updated(part)
+    assert found.sizes == {key: n for key, n in whole.sizes.items() if key not in let_go}
+    left = whole.marginal(list(found.sizes))
+    np.testing.assert_allclose(found.covariance, left.covariance, atol=1e-15)
+    assert np.abs(local(left.values, found.values, left.sizes)).max() < 1e-12
+
+
+def test_an_update_needs_one_more_covariance() -> None:
+    """And no others of its size: the memory of a large place takes gigabytes."""
+    count, few = 2000, 50
+    sizes = {M(number): few for number in range(count // few)}
+    values = gtsam.Values()
+    for key in sizes:
+        values.insert(key, np.zeros(few))
+    before = JointGaussian(values, sizes, np.eye(count))
+    part = before.marginal([M(0)])
+    tracemalloc.start()
+    after = before.updated(part)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # 256 of 2,000 rows are updated at once, and the 50 that are known carry over to all.
+    assert most < 1.5 * after.covariance.nbytes
 
 
 def test_nothing_learnt_changes_nothing() -> None:
