@@ -6,7 +6,7 @@ given the weights has their derivatives, in a factor of few rows. With all of it
 descent took twice the time; with all of it in a linear one poses ended 0.007 sigmas off.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +20,7 @@ from l2m_gtsam.solve.linear_algebra import correlation_factor, triangular_inform
 
 ROUNDING = 1e-12  # of a correlation
 ROWS = 256  # of a covariance that are updated at once
+PIECE = 4e9  # multiplications: some 0.3 s
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,8 @@ def conditioned(
     after: FloatArray,
     cross: FloatArray,
     into: FloatArray,
-) -> Conditioned:
-    """Propagate an update of k components of a Gaussian to r others.
+) -> Generator[None, None, Conditioned]:
+    """Propagate an update of k components of a Gaussian to r others; yields between pieces of work.
 
     Given the first, the others are independent of the measurements: the conditional p(others |
     first) stays, as in the Rauch-Tung-Striebel smoother.
@@ -77,16 +78,30 @@ def conditioned(
         scaled = rows / sigma[:, None]
         return np.asarray(solve_triangular(lower, scaled, lower=True, check_finite=False))
 
-    B = whitened(P[np.ix_(s, r)])
     less = np.eye(len(s)) - whitened(whitened(after).T)
-    removed = 0.5 * (less + less.T) @ B
+    less, (k, n), done = 0.5 * (less + less.T), (len(s), len(r)), 0
+    B, removed = np.empty((k, n)), np.empty((k, n))
+    rows = [slice(first, first + ROWS) for first in range(0, n, ROWS)]
+    for own in rows:
+        B[:, own] = whitened(P[np.ix_(s, r[own])])
+        removed[:, own] = less @ B[:, own]
+        done = yield from paused(done + 2 * k * B[:, own].size)
     # Few rows at once, and from the diagonal on: beside it nothing of its size is needed.
-    for first in range(0, len(r), ROWS):
-        own, onward = slice(first, first + ROWS), slice(first, None)
+    for own in rows:
+        onward = slice(own.start, None)
         left = P[np.ix_(r[own], r[onward])] - B[:, own].T @ removed[:, onward]
         into[own, onward], into[onward, own] = left, left.T
+        done = yield from paused(done + k * left.size)
     carried = B.T @ whitened(np.column_stack([shift, cross]))
     return Conditioned(carried[:, 0], into, carried[:, 1:])
+
+
+def paused(done: int) -> Generator[None, None, int]:
+    """Yield where so many multiplications are a piece of work; return those of the next piece."""
+    if done < PIECE:
+        return done
+    yield
+    return 0
 
 
 @dataclass(frozen=True)
@@ -121,8 +136,12 @@ class JointGaussian:
         at, sizes = self.columns(keys), {key: self.sizes[key] for key in keys}
         return JointGaussian(part_of(self.values, keys), sizes, self.covariance[np.ix_(at, at)])
 
-    def updated(self, after: "JointGaussian", let_go: Collection[int] = ()) -> "JointGaussian":
+    def updated(
+        self, after: "JointGaussian", let_go: Collection[int] = ()
+    ) -> Generator[None, None, "JointGaussian"]:
         """Return the Gaussian after an update of some variables that adds others.
+
+        Yields between pieces of the work.
 
         Parameters
         ----------
@@ -145,7 +164,7 @@ class JointGaussian:
         covariance = np.empty((last.start + len(kept.covariance),) * 2)
         left, across = covariance[: last.start, : last.start], covariance[: last.start, last]
         cross = cross[:, after.columns(kept.sizes)]
-        found = conditioned(self.covariance, s, r, shift, own, cross, left)
+        found = yield from conditioned(self.covariance, s, r, shift, own, cross, left)
         across[:] = found.cross
         moves = gtsam.Pose3.ExpmapDerivative
         for rows in (left, left.T, across):

@@ -172,7 +172,7 @@ class OpenSection:
         posterior = yield from self._remembered()
         anchors = {X(tile.anchor) for tile in self._tiles}
         let_go = {X(self._first)} - anchors - {X(self._last)}
-        known = self._memory.known.updated(posterior, let_go)
+        known = yield from self._memory.known.updated(posterior, let_go)
         yield
         tiles = list(self._tiles)
         for each in self._counted:
@@ -201,7 +201,7 @@ class OpenSection:
         found, sizes = joint_posterior(linear, keys), {key: self._size(key) for key in keys}
         yield
         values = retracted(part_of(self._values, keys), sizes, found.mean)
-        return self._after.updated(JointGaussian(values, sizes, found.covariance))
+        return (yield from self._after.updated(JointGaussian(values, sizes, found.covariance)))
 
     def next(self, memory: FieldMemory, first: int) -> "OpenSection":
         """Return a new section from a key pose on."""

@@ -20,6 +20,7 @@ from l2m_gtsam.slam.joint_gaussian import (
 from l2m_gtsam.slam.marginals import joint_posterior, ordered
 from l2m_gtsam.slam.solver import colamd_ordering, levenberg_marquardt
 from tests.reference.dense_newton import newton
+from tests.support.stepwise import completed
 
 ROUNDING = 1e-8  # of matrices of condition 1e4, with 1e-12 added to correlations
 
@@ -44,7 +45,8 @@ def test_others_follow_as_if_all_had_been_solved_together(
     posterior = np.linalg.inv(np.linalg.inv(P) + J.T @ J)
     mean = posterior @ J.T @ y
     after = np.asarray(posterior[np.ix_(s, s)])
-    found = conditioned(P, s, r, mean[s], after, after, np.empty((others, others)))
+    into = np.empty((others, others))
+    found, _ = completed(conditioned(P, s, r, mean[s], after, after, into))
     np.testing.assert_allclose(found.shift, mean[r], atol=ROUNDING)
     np.testing.assert_allclose(found.covariance, posterior[np.ix_(r, r)], atol=ROUNDING)
     np.testing.assert_allclose(found.cross, posterior[np.ix_(r, s)], atol=ROUNDING)
@@ -114,7 +116,7 @@ def test_what_some_variables_tell_the_others_is_what_all_together_say(
     graph = seen(rng, before.values, step)
     values, whole = solved(graph, before)
     _, part = solved(graph, before.marginal([X(3), M(1), X(7)]))
-    after = before.updated(part)
+    after, _ = completed(before.updated(part))
     assert set(after.sizes) == set(whole.sizes)
     whole = whole.marginal(list(after.sizes))
     apart = local(after.values, values, after.sizes)
@@ -129,7 +131,7 @@ def test_what_is_let_go_is_marginalised(let_go: tuple[int, ...]) -> None:
     rng = np.random.default_rng(6)
     before = known(rng, 0.01)
     part = solved(seen(rng, before.values, 0.1), before.marginal([X(3), M(1), X(7)]))[1]
-    found, whole = before.updated(part, let_go), before.updated(part)
+    (found, _), (whole, _) = (completed(before.updated(part, each)) for each in (let_go, ()))
     assert found.sizes == {key: n for key, n in whole.sizes.items() if key not in let_go}
     left = whole.marginal(list(found.sizes))
     np.testing.assert_allclose(found.covariance, left.covariance, atol=1e-15)
@@ -146,17 +148,31 @@ def test_an_update_needs_one_more_covariance() -> None:
     before = JointGaussian(values, sizes, np.eye(count))
     part = before.marginal([M(0)])
     tracemalloc.start()
-    after = before.updated(part)
+    after, _ = completed(before.updated(part))
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     # 256 of 2,000 rows are updated at once, and the 50 that are known carry over to all.
     assert most < 1.5 * after.covariance.nbytes
 
 
+def test_in_pieces_it_is_the_same_update(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a vehicle an update of a large place would take seconds at one key pose."""
+    rng = np.random.default_rng(7)
+    before = known(rng, 0.01)
+    part = before.marginal([X(3), M(1)])
+    at_once, pauses = completed(before.updated(part))
+    assert pauses == 0
+    monkeypatch.setattr("l2m_gtsam.slam.joint_gaussian.PIECE", 5)
+    monkeypatch.setattr("l2m_gtsam.slam.joint_gaussian.ROWS", 3)
+    in_pieces, pauses = completed(before.updated(part))
+    assert pauses == 12  # twice for each three of the 16 others
+    np.testing.assert_allclose(in_pieces.covariance, at_once.covariance, atol=1e-15)
+
+
 def test_nothing_learnt_changes_nothing() -> None:
     rng = np.random.default_rng(5)
     before = known(rng, 0.01)
-    after = before.updated(before.marginal([M(0), X(7)]))
+    after, _ = completed(before.updated(before.marginal([M(0), X(7)])))
     there = after.marginal(list(before.sizes))
     np.testing.assert_allclose(there.covariance, before.covariance, atol=1e-10)
     assert np.abs(local(before.values, there.values, before.sizes)).max() < 1e-12

@@ -15,6 +15,7 @@ from l2m_gtsam.slam.solver import (
     stepwise_levenberg_marquardt,
 )
 from tests.drives.pose_chain import FAR_APART, chain
+from tests.support.stepwise import completed
 
 
 @pytest.mark.parametrize(("start", "step"), FAR_APART)
@@ -106,14 +107,9 @@ def in_steps(
     graph: gtsam.NonlinearFactorGraph, begin: gtsam.Values, most: int, close: float = TOLERANCE
 ) -> tuple[gtsam.Values, int]:
     """Return values that are solved for step by step, and how often the work was interrupted."""
-    work = stepwise_levenberg_marquardt(graph, begin, colamd_ordering(graph), most, close)
-    pauses = 0
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            return end.value, pauses
-        pauses += 1
+    return completed(
+        stepwise_levenberg_marquardt(graph, begin, colamd_ordering(graph), most, close)
+    )
 
 
 @pytest.mark.parametrize("most", [1, 3, 50])
