@@ -79,19 +79,20 @@ def conditioned(
         return np.asarray(solve_triangular(lower, scaled, lower=True, check_finite=False))
 
     less = np.eye(len(s)) - whitened(whitened(after).T)
-    less, (k, n), done = 0.5 * (less + less.T), (len(s), len(r)), 0
-    B, removed = np.empty((k, n)), np.empty((k, n))
-    rows = [slice(first, first + ROWS) for first in range(0, n, ROWS)]
+    less = 0.5 * (less + less.T)
+    B = np.empty((len(s), len(r)))
+    removed, done = np.empty_like(B), 0
+    rows = [slice(first, first + ROWS) for first in range(0, len(r), ROWS)]
     for own in rows:
         B[:, own] = whitened(P[np.ix_(s, r[own])])
         removed[:, own] = less @ B[:, own]
-        done = yield from paused(done + 2 * k * B[:, own].size)
+        done = yield from paused(done + 2 * len(s) * B[:, own].size)
     # Few rows at once, and from the diagonal on: beside it nothing of its size is needed.
     for own in rows:
         onward = slice(own.start, None)
         left = P[np.ix_(r[own], r[onward])] - B[:, own].T @ removed[:, onward]
         into[own, onward], into[onward, own] = left, left.T
-        done = yield from paused(done + k * left.size)
+        done = yield from paused(done + len(s) * left.size)
     carried = B.T @ whitened(np.column_stack([shift, cross]))
     return Conditioned(carried[:, 0], into, carried[:, 1:])
 
