@@ -30,15 +30,12 @@ class Conditioned:
     Attributes
     ----------
     shift
-        Of the others' mean, shape (r,).
-    covariance
-        Of the others, shape (r, r).
+        Of their mean, shape (r,).
     cross
-        Covariance of the others with the updated components, shape (r, q).
+        Their covariance with what is estimated afterwards, shape (r, q).
     """
 
     shift: FloatArray
-    covariance: FloatArray
     cross: FloatArray
 
 
@@ -67,7 +64,7 @@ def conditioned(
     after
         Their covariance afterwards, shape (k, k).
     cross
-        Their covariance with all that is estimated afterwards, shape (k, q).
+        Their covariance with what is estimated afterwards, shape (k, q).
     into
         Where the covariance of the others is written, shape (r, r).
     """
@@ -94,7 +91,7 @@ def conditioned(
         into[own, onward], into[onward, own] = left, left.T
         done = yield from paused(done + len(s) * left.size)
     carried = B.T @ whitened(np.column_stack([shift, cross]))
-    return Conditioned(carried[:, 0], into, carried[:, 1:])
+    return Conditioned(carried[:, 0], carried[:, 1:])
 
 
 def paused(done: int) -> Generator[None, None, int]:
@@ -159,8 +156,10 @@ class JointGaussian:
         shift = local(part_of(self.values, list(shared)), after.values, shared)
         # A right perturbation at the posterior pose, expressed at the prior pose.
         was = gtsam.Pose3.LogmapDerivative
-        cross = turned(after.covariance[now], shared, shift, was)
-        own = turned(cross[:, now].T, shared, shift, was)
+        cross = after.covariance[now]
+        turn(cross, shared, shift, was)
+        own = cross[:, now].T
+        turn(own, shared, shift, was)
         r, last = self.columns(rest), slice(sum(rest.values()), None)
         covariance = np.empty((last.start + len(kept.covariance),) * 2)
         left, across = covariance[: last.start, : last.start], covariance[: last.start, last]
@@ -195,18 +194,6 @@ def retracted(values: gtsam.Values, sizes: Mapping[int, int], step: FloatArray) 
     for key, own in slices_of(sizes).items():
         by_key.insert(key, step[own])
     return values.retract(by_key)
-
-
-def turned(
-    rows: FloatArray,
-    sizes: Mapping[int, int],
-    shift: FloatArray,
-    derivative: Callable[[FloatArray], FloatArray],
-) -> FloatArray:
-    """Return rows (n, q) of n components; those of poses are multiplied by a derivative."""
-    found = rows.copy()
-    turn(found, sizes, shift, derivative)
-    return found
 
 
 def turn(

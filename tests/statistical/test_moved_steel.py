@@ -12,7 +12,7 @@ WITHIN = 1.5  # times the error of the same drive without the move
 LARGEST_NEES = 12  # twice the six of one pose: poses of one drive err together
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2, 3, 4, 7])
 def test_laps_close_though_steel_was_moved(seed: int) -> None:
     drives = moved_steel(seed)
     still, moved = (
@@ -21,4 +21,5 @@ def test_laps_close_though_steel_was_moved(seed: int) -> None:
     truth = drives.still.truth
     before, after = position_error(truth, still), position_error(truth, moved)
     assert after < WITHIN * before, f"{before:.3f} m without the move, {after:.3f} m with it"
-    assert pose_nees(truth, moved).mean() < LARGEST_NEES
+    for each in (still, moved):
+        assert pose_nees(truth, each).mean() < LARGEST_NEES

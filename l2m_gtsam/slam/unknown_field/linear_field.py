@@ -52,7 +52,7 @@ class LinearField(ABC):
     def half_wave(self) -> float:
         """Half of the shortest wave that it holds, metres; 0 where the others count as noise."""
 
-    def trusted(self, points: FloatArray, trust: FloatArray) -> FloatArray:
+    def away_from_steel(self, points: FloatArray, trust: FloatArray) -> FloatArray:
         """Return the weights of readings, 0 where many others have weight 0, shape (N,).
 
         Steel that is nearer than the waves are short makes a field that they do not hold. On the

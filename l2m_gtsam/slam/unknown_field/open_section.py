@@ -7,26 +7,13 @@ from types import MappingProxyType
 import gtsam
 import numpy as np
 
-from l2m_factors import (
-    M,
-    X,
-)
+from l2m_factors import M, X
 from l2m_gtsam.calibration.factor_graph import unit_priors
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.joint_gaussian import (
-    JointGaussian,
-    is_pose,
-    part_of,
-    prior_factors,
-    retracted,
-)
+from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose, part_of, prior_factors, retracted
 from l2m_gtsam.slam.key_pose_readings import joined_readings
-from l2m_gtsam.slam.map_prediction import (
-    PlacedReadings,
-    place_readings,
-    sensors_in,
-)
+from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings, sensors_in
 from l2m_gtsam.slam.marginals import Marginals, joint_posterior
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose

@@ -188,7 +188,7 @@ class TiledDrive:
         order = np.argsort(np.concatenate([tile.rows for tile in tiles]))
         return chosen_rows(joined_rows(parts), order)
 
-    def trusted(self, trust: FloatArray) -> FloatArray:
+    def away_from_steel(self, trust: FloatArray) -> FloatArray:
         """Return the weights of all N readings, 0 where waves do not hold the field, shape (N,).
 
         Parameters
@@ -196,10 +196,10 @@ class TiledDrive:
         trust
             Weight of each by itself, shape (N,).
         """
-        trusted = trust.copy()
+        counted = trust.copy()
         for tile in self.tiles:
-            trusted[tile.rows] = tile.field.trusted(tile.placed.x, trust[tile.rows])
-        return trusted
+            counted[tile.rows] = tile.field.away_from_steel(tile.placed.x, trust[tile.rows])
+        return counted
 
     def penalties(
         self, noise: FloatArray, weights: FloatArray, squared: FloatArray

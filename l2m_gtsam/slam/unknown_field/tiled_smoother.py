@@ -159,7 +159,7 @@ class TiledProblem:
         r2 = predicted.squared(noise)
         weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
         if np.isinf(mu):  # before, poses may be wrong where readings are rejected
-            weights = tiled.trusted(weights)
+            weights = tiled.away_from_steel(weights)
         penalties = tiled.penalties(noise, weights, predicted.prediction.squared(own))
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         fixed = None if self._free else self._drive.sensors.fixed()

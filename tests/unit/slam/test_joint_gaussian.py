@@ -48,7 +48,7 @@ def test_others_follow_as_if_all_had_been_solved_together(
     into = np.empty((others, others))
     found, _ = completed(conditioned(P, s, r, mean[s], after, after, into))
     np.testing.assert_allclose(found.shift, mean[r], atol=ROUNDING)
-    np.testing.assert_allclose(found.covariance, posterior[np.ix_(r, r)], atol=ROUNDING)
+    np.testing.assert_allclose(into, posterior[np.ix_(r, r)], atol=ROUNDING)
     np.testing.assert_allclose(found.cross, posterior[np.ix_(r, s)], atol=ROUNDING)
 
 

@@ -135,7 +135,7 @@ def test_beside_steel_that_waves_do_not_hold_no_reading_counts() -> None:
     x = np.linspace(-1.5, 1.5, 61)
     points, trust = np.column_stack([x, np.zeros((61, 2))]), np.where(np.abs(x) < 0.32, 0.0, 0.5)
     expected = np.where(np.abs(x) < tile.half_wave + 0.3, 0.0, 0.5)
-    np.testing.assert_array_equal(tile.trusted(points, trust), expected)
+    np.testing.assert_array_equal(tile.away_from_steel(points, trust), expected)
 
 
 @pytest.mark.parametrize("apart", [1, 20])
@@ -144,7 +144,7 @@ def test_two_wrong_readings_or_some_far_apart_are_no_steel(apart: int) -> None:
     points = np.column_stack([np.linspace(-1.5, 1.5, 61), np.zeros((61, 2))])
     trust = np.ones(61)
     trust[[20, 20 + apart] if apart == 1 else [0, apart, 2 * apart, 3 * apart]] = 0.0
-    np.testing.assert_array_equal(tile.trusted(points, trust), trust)
+    np.testing.assert_array_equal(tile.away_from_steel(points, trust), trust)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -152,8 +152,8 @@ def test_spikes_among_many_readings_are_no_steel(seed: int) -> None:
     tile = WaveTile.about(PRIOR, np.eye(3), places(0))
     rng = np.random.default_rng(seed)
     points, trust = rng.uniform(-1.5, 1.5, (3000, 3)), np.ones(3000)
-    trust[rng.random(3000) < 0.08] = 0.0  # some 60 of 800 in a half wave about each
-    np.testing.assert_array_equal(tile.trusted(points, trust), trust)
+    trust[rng.random(3000) < 0.08] = 0.0  # some 18 of 225 in a half wave about each
+    np.testing.assert_array_equal(tile.away_from_steel(points, trust), trust)
 
 
 def test_a_prior_is_not_that_of_steel_at_arms_length() -> None:
