@@ -19,9 +19,10 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.lidar.loop_closures import LoopOptions
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.online.online_pose import OnlinePose
 from l2m_gtsam.slam.online.replay import Message, give, messages, with_scans
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher
-from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.statistics import nees
 from tests.drives.exploring import rms

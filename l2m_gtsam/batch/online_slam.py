@@ -38,10 +38,11 @@ from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.moving_fields import without_moving_fields
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.online.events import OnlineEvent
+from l2m_gtsam.slam.online.online_pose import OnlinePose
 from l2m_gtsam.slam.online.replay import give, messages, with_scans
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanMatcher
-from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import CalibrationUse, Usage
 from l2m_gtsam.slam.result import refined
 from l2m_gtsam.slam.unknown_field.explorer import Explorer

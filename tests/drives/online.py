@@ -7,8 +7,9 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording, Trajectory
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
+from l2m_gtsam.slam.online.online_pose import OnlinePose
 from l2m_gtsam.slam.online.replay import FieldReading, Message, give
-from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from tests.drives.slam import COARSE, SlamDrive, calibrated, small_hall
 from tests.support.pose_errors import pose_nees

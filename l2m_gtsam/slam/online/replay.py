@@ -10,7 +10,8 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, Recording
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose, pose_of
-from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.online.online_pose import OnlinePose
+from l2m_gtsam.slam.online.session import OnlineSlam
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ key pose relative to its tile.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
-from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory, joined_rows
+from l2m_gtsam.data import FloatArray, Trajectory, joined_rows
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.maps.field_map import Surveyed
@@ -20,7 +20,7 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import StartVerdict
 from l2m_gtsam.records.scans import Scan
-from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose, as_transform
+from l2m_gtsam.slam.drive import EXACT_START, StartPose, as_transform
 from l2m_gtsam.slam.held_calibration import with_calibration_use
 from l2m_gtsam.slam.localisation import known_sensors, left_out, start_pose, why_unusable
 from l2m_gtsam.slam.online.arguments import refuse_unusable
@@ -33,6 +33,7 @@ from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.intake import Intake
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose, trajectory_of
+from l2m_gtsam.slam.online.online_pose import OnlinePose
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanLinks, ScanMatcher
 from l2m_gtsam.slam.online.start_search import StartSearchState
 from l2m_gtsam.slam.online.step_doubts import StepDecision
@@ -51,35 +52,6 @@ IMPOSSIBLE = (
     "follow odometry until the field is learnt anew"
 )
 Estimator = BranchedFollower | Explorer | OneFieldExplorer
-
-
-@dataclass(frozen=True)
-class OnlinePose:
-    """What is known of a key pose when it is made.
-
-    Attributes
-    ----------
-    stamp_ns
-        Its time.
-    T_map_lidar
-        Pose of the lidar.
-    covariance
-        Of a right perturbation of it, rotation (rad) before translation (m), shape (6, 6).
-    sensors
-        Calibrations as they are known by then, with the covariances of then.
-    """
-
-    stamp_ns: int
-    T_map_lidar: RigidTransform
-    covariance: FloatArray
-    sensors: KnownSensors
-
-    @classmethod
-    def of(cls, stamp_ns: int, belief: Belief) -> "OnlinePose":
-        """Return a belief as it is handed out."""
-        # A part of the belief's covariance would keep all of it for as long as the pose is kept.
-        covariance = belief.pose_covariance.copy()
-        return cls(stamp_ns, as_transform(belief.pose), covariance, belief.known_sensors)
 
 
 class OnlineSlam:

@@ -13,9 +13,10 @@ from l2m_gtsam.data import Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.online.events import EventKind
+from l2m_gtsam.slam.online.online_pose import OnlinePose
 from l2m_gtsam.slam.online.replay import give, messages
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
-from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field import one_field_explorer
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import Hypotheses

@@ -13,8 +13,9 @@ from l2m_gtsam.records.sensor_models import MovingField
 from l2m_gtsam.slam.localisation import usable_sensors
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.odometry_pose import OdometryPose
+from l2m_gtsam.slam.online.online_pose import OnlinePose
 from l2m_gtsam.slam.online.replay import FieldReading, Message, messages
-from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.online.session import OnlineSlam
 from tests.drives.online import (
     OPTIONS,
     WORLD,
