@@ -10,6 +10,7 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import FloatArray, IntArray
@@ -45,6 +46,7 @@ from l2m_gtsam.slam.unknown_field.whole_field import (
 )
 
 HELD = 1e-3  # of odometry's sigmas: steps that are known so well leave the poses where they are
+TOGETHER = 256  # key poses whose distances are computed at once
 SETTLED = 1.0  # movement of the poses in the last round, in their sigmas
 
 
@@ -254,6 +256,11 @@ def returned(p: FloatArray, path: FloatArray, near_m: float) -> IntArray:
     near_m
         Distance within which the field is the same.
     """
-    apart = np.linalg.norm(p[:, None] - p, axis=2)
-    earlier = path[:, None] - path >= AWAY_M + near_m
-    return np.flatnonzero((earlier & (apart <= near_m)).any(axis=1))
+    before = np.searchsorted(path, path - (AWAY_M + near_m), side="right")
+    found = [
+        k + row
+        for k in range(0, len(p), TOGETHER)
+        for row, near in enumerate(cdist(p[k : k + TOGETHER], p) <= near_m)
+        if near[: before[k + row]].any()
+    ]
+    return np.array(found, dtype=np.int64)
