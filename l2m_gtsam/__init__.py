@@ -28,19 +28,12 @@ __all__ = [
     "save_map",
 ]
 
-_WHERE = {
-    "drive": "arrays",
-    "known_sensor": "arrays",
-    "build_map": "calls",
-    "calibrate": "calls",
-    "keep_map_up": "calls",
-    "localise": "calls",
-    "load_map": "files",
-    "read_bag": "files",
-    "read_calibration": "files",
-    "read_suite": "files",
-    "save_map": "files",
+_NAMES = {
+    "arrays": ("drive", "known_sensor"),
+    "calls": ("build_map", "calibrate", "keep_map_up", "localise"),
+    "files": ("load_map", "read_bag", "read_calibration", "read_suite", "save_map"),
 }
+_WHERE = {name: module for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:

@@ -156,19 +156,8 @@ app = typer.Typer(
 )
 app.add_typer(map_app, name="map")
 for _command in (
-    study,
-    batch,
-    export,
-    apply,
-    report,
-    validate,
-    slam,
-    inspect,
-    config,
-    simulate,
-    calibrate,
-    plan,
-    demo,
+    *(inspect, config, plan, calibrate, report, validate, export, apply),
+    *(batch, slam, demo, simulate, study),
 ):
     app.command()(_command)
 

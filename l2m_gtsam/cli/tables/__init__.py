@@ -1,6 +1,6 @@
 """Results as tables and lines in the terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from rich import box
@@ -14,13 +14,16 @@ OPEN = "-"  # what is not determined
 COLOURS = {"pass": "green", "warn": "yellow", "fail": "red"}
 
 
-def new_table(title: str, first: str, numbers: Sequence[str], caption: str | None = None) -> Table:
-    """Return an empty table: a column of names, then columns of numbers.
+def new_table(
+    title: str, names: Sequence[str], numbers: Sequence[str], caption: str | None = None
+) -> Table:
+    """Return an empty table: columns of names, then columns of numbers.
 
     The most important ones come first: a narrow terminal shows those that fit.
     """
     table = plain_table(title, caption)
-    table.add_column(first, no_wrap=True)
+    for heading in names:
+        table.add_column(heading, no_wrap=True)
     add_numbers(table, numbers)
     return table
 
@@ -63,6 +66,15 @@ def sigmas_cell(sigmas: FloatArray) -> str:
     texts = sigma_entries(sigmas.tolist())
     known = np.isfinite(sigmas)
     return " ".join(text if is_known else OPEN for text, is_known in zip(texts, known, strict=True))
+
+
+def held_note(reasons: Mapping[str, str]) -> str:
+    """Return of which sensors time offsets are held, and why the first is; else nothing."""
+    if not reasons:
+        return ""
+    first, reason = next(iter(reasons.items()))
+    more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
+    return f"time offset of {first}{more} {reason}"
 
 
 def coloured(level: str) -> str:

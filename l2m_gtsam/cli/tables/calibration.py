@@ -4,7 +4,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.cli.tables import OPEN, add_numbers, new_table, plain_table, sigmas_cell, vector_cell
+from l2m_gtsam.cli.tables import OPEN, held_note, new_table, sigmas_cell, vector_cell
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.qa.verdict.places import stretch_head
 from l2m_gtsam.records.calibration import (
@@ -46,10 +46,7 @@ MODEL_HEADINGS = (
 def calibration_table(result: CalibrationResult) -> Table:
     """Return one row per sensor: position, H and rotation with their sigmas, clock, readings."""
     title = "Calibration: B_meas = C @ B_lidar + H; rms: length of residuals; ±: one sigma"
-    table = plain_table(title)
-    table.add_column("sensor", no_wrap=True)
-    table.add_column("status", no_wrap=True)
-    add_numbers(table, HEADINGS)
+    table = new_table(title, ("sensor", "status"), HEADINGS)
     for sensor in result.sensors:
         table.add_row(*_calibration_row(sensor))
     return table
@@ -130,23 +127,15 @@ def missing_note(result: CalibrationResult) -> tuple[str, ...]:
 
 def held_clocks_note(result: CalibrationResult) -> str:
     """Return which sensors' time offsets are taken as zero and why, as a sentence; else nothing."""
-    held = {
-        sensor.sensor: sensor.time_offset.held
-        for sensor in result.sensors
-        if sensor.time_offset is not None and not sensor.time_offset.estimated
-    }
-    if not held:
-        return ""
-    first, reason = next(iter(held.items()))
-    more = f" and {len(held) - 1} more" if len(held) > 1 else ""
-    return f"time offset of {first}{more} {reason}"
+    offsets = ((sensor.sensor, sensor.time_offset) for sensor in result.sensors)
+    return held_note({name: each.held for name, each in offsets if each and each.held})
 
 
 def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Table:
     """Return truth, estimate, error and sigma of every sensor's position, and errors of C and H."""
     errors = ("t error (mm)", "sigma (mm)", "|H error| (uT)", "sigma (uT)")
     others = ("|C error|", "sigma of C", "true t (m)", "estimated t (m)")
-    table = new_table("Truth and estimate", "sensor", [*errors, *others])
+    table = new_table("Truth and estimate", ("sensor",), [*errors, *others])
     for known in truth:
         table.add_row(*_truth_row(known, result[known.sensor]))
     return table
@@ -210,7 +199,7 @@ def model_table(sensor: str, comparison: ModelComparison) -> Table:
         f"Models of {escape(sensor)}{escape(numbers)}: {comparison.readings:,} readings "
         f"with the information of {comparison.independent:,.0f} independent ones, "
         f"{comparison.segments} segments held out in turn",
-        "model",
+        ("model",),
         MODEL_HEADINGS,
         f"recommended: {comparison.recommended}; {comparison.reason}",
     )

@@ -6,7 +6,14 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.cli.tables import add_numbers, add_text, new_table, plain_table, sigmas_cell
+from l2m_gtsam.cli.tables import (
+    add_numbers,
+    add_text,
+    held_note,
+    new_table,
+    plain_table,
+    sigmas_cell,
+)
 from l2m_gtsam.records.plan import DrivePlan, NoiseSource, SensorPlan, Worst
 from l2m_gtsam.storage.bag_report import BagReport, TopicReport
 from l2m_gtsam.text import in_unit, sigma_alone
@@ -20,7 +27,7 @@ def plan_table(plan: DrivePlan) -> Table:
     """Return one row per sensor: sigmas of position, C, H and rotation, and what stays open."""
     title = f"What this drive will determine, with a noise of {plan.noise:.3g} uT"
     caption = "sigmas; of C the largest of each column; - is not determined"
-    table = new_table(title, "sensor", HEADINGS[:3], caption)
+    table = new_table(title, ("sensor",), HEADINGS[:3], caption)
     add_text(table, "not determined", 14)
     add_numbers(table, (*HEADINGS[3:], *OTHERS))
     for sensor in plan.sensors:
@@ -30,12 +37,8 @@ def plan_table(plan: DrivePlan) -> Table:
 
 def held_plan_note(plan: DrivePlan) -> str:
     """Return of which sensors time offsets will be taken as zero and why; else nothing."""
-    held = {sensor.sensor: sensor.offset_held for sensor in plan.sensors if sensor.offset_held}
-    if not held:
-        return ""
-    first, reason = next(iter(held.items()))
-    more = f" and {len(held) - 1} more" if len(held) > 1 else ""
-    return f"time offset of {first}{more} will be {reason}"
+    held = [each for each in plan.sensors if each.offset_held]
+    return held_note({each.sensor: f"will be {each.offset_held}" for each in held})
 
 
 NOISE_SOURCES = {

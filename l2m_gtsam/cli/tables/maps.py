@@ -7,7 +7,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from l2m_gtsam.batch.maps import MapDescription
-from l2m_gtsam.cli.tables import add_numbers, add_text, plain_table, vector_cell
+from l2m_gtsam.cli.tables import add_numbers, add_text, new_table, plain_table, vector_cell
 from l2m_gtsam.maps.compare import KindFigures, KindResult, MapComparison
 from l2m_gtsam.qa.report.facts import period
 from l2m_gtsam.records.map_diary import MapDiary, between, doubtful, words_of
@@ -120,10 +120,7 @@ def changes_table(diary: MapDiary) -> Table:
     caption = doubtful(diary)
     if not diary.changes:
         caption = "nothing came or went that the drives noticed"
-    table = plain_table(f"What changed: {since}", caption)
-    for heading in ("what", "between"):
-        table.add_column(heading, no_wrap=True)
-    add_numbers(table, CHANGE_HEADINGS)
+    table = new_table(f"What changed: {since}", ("what", "between"), CHANGE_HEADINGS, caption)
     for number in reversed(range(len(diary.changes))):
         source = diary.changes[number].source
         position = float(np.max(source.position_sigma))

@@ -17,7 +17,7 @@ MOST_EVENTS = 20  # that are printed
 def slam_table(result: LocalisationResult) -> Table:
     """Return one row per sensor: what its readings were worth."""
     counts = ("on key poses", "rejected", "outside map")
-    table = new_table("Readings", "sensor", ["rms per axis (uT)", "chi2 per dof", *counts])
+    table = new_table("Readings", ("sensor",), ["rms per axis (uT)", "chi2 per dof", *counts])
     for each in result.sensors:
         table.add_row(
             escape(each.sensor),

@@ -4,7 +4,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.cli.tables import add_numbers, coloured, new_table, plain_table
+from l2m_gtsam.cli.tables import coloured, new_table
 from l2m_gtsam.records.validation import (
     CalibrationComparison,
     ComparedSensor,
@@ -18,16 +18,15 @@ from l2m_gtsam.text import significant, with_sigma
 
 def validation_table(drive: DriveValidation, verdict: Verdict) -> Table:
     """Return one row per sensor: field errors before and after, NIS, and the verdict."""
-    table = plain_table(
+    figures = ("e_B before", "e_B after", "NIS", "readings", "rejected", "outside")
+    table = new_table(
         "Readings beside pose, map and calibration",
+        ("sensor", "verdict"),
+        (*figures, "distance", "x", "y", "z"),
         "e_B: mean squared distance to the map's field (uT^2); distance and axes (of the lidar): "
         "mean ± std after the calibration (uT); NIS per degree of freedom, in brackets where 95 % "
         "of all lie",
     )
-    for heading in ("sensor", "verdict"):
-        table.add_column(heading, no_wrap=True)
-    add_numbers(table, ("e_B before", "e_B after", "NIS", "readings", "rejected", "outside"))
-    add_numbers(table, ("distance", "x", "y", "z"))
     levels = {each.sensor: each.level for each in verdict.sensors}
     for sensor in drive.sensors:
         name = escape(sensor.sensor)
@@ -60,7 +59,7 @@ def change_table(comparison: CalibrationComparison) -> Table:
     """Return one row per sensor: differences with their sigmas, and the chi-square tests."""
     table = new_table(
         "New less old calibration",
-        "sensor",
+        ("sensor",),
         ("all", "place", "rotation", "H", "gains", "angles", "C", "less t (mm)", "less H (uT)"),
         "chi-square / degrees of freedom over each part and all; ! where chance makes as much less "
         "than once in 1,000 times",

@@ -51,7 +51,7 @@ def test_all_columns_are_there_when_asked_for(
 def test_long_text_is_broken_in_its_column(
     width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    table = new_table("t", "topic", ["count"])
+    table = new_table("t", ("topic",), ["count"])
     add_text(table, "use")
     table.add_row("/a", "12", 30 * "word ")
     lines = lines_of(table, width, monkeypatch, capsys)
@@ -78,7 +78,7 @@ def test_control_characters_of_names_are_text(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name = "/mag\x1b]0;title\x07\u202e\n"
-    table = new_table(name, "topic", ["count"], name)
+    table = new_table(name, ("topic",), ["count"], name)
     add_text(table, "use")
     table.add_row(name, "12", name)
     out = "\n".join(lines_of(table, 200, monkeypatch, capsys))
