@@ -89,8 +89,7 @@ def calibrate_bags(
         check_outputs(view)
     saved = SavedMap.read(map_path)
     recording = read_drives_on(saved, bags, config, progress)
-    field_map, source = saved.open(progress, recording.parts), source_file(map_path)
-    opened = OpenMap.of(saved, field_map, source)
+    opened = OpenMap.of(saved, progress, recording.parts)
     return calibrate_drive(recording, opened, config, out, progress, truth, view)
 
 

@@ -109,16 +109,20 @@ class OpenMap:
 
     field_map: FieldMap
     source: SourceFile
-    doubts: tuple[str, ...] = ()
-    origin: MapOrigin | None = None
+    doubts: tuple[str, ...]
+    origin: MapOrigin
 
     @classmethod
-    def of(cls, saved: "SavedMap", field_map: FieldMap, source: SourceFile) -> "OpenMap":
-        """Return a map with what its file says of where it came from."""
+    def of(
+        cls, saved: "SavedMap", progress: Progress, drives: Sequence[Recording] = ()
+    ) -> "OpenMap":
+        """Return a map with what its file says of where it came from; see ``SavedMap.open``."""
+        field_map = saved.open(progress, drives)
         diary = field_map.diary if isinstance(field_map, Remembering) else None
         later = () if diary is None else diary.drives[1:]
-        origin = replace(saved.origin, updated=later[-1].ended if later else None)
-        return cls(field_map, source, saved.doubts, origin)
+        updated = later[-1].ended if later else None
+        origin = replace(origin_of(saved.state.provenance), updated=updated)
+        return cls(field_map, source_file(saved.path), saved.doubts, origin)
 
 
 @dataclass(frozen=True)
@@ -142,25 +146,10 @@ class SavedMap:
     @property
     def bags(self) -> list[dict[str, Any]]:
         """What the file says of the bags that it was made from; it may have been tampered with."""
-        bags = self._list_of("bags")
+        bags = entries_of(self.state.provenance, "bags")
         if not all(isinstance(bag, dict) for bag in bags):
             raise MapError(f"{self.path}: its list of bags is damaged; build the map again")
         return bags
-
-    @property
-    def updates(self) -> list[Any]:
-        """What the file says of the updates that it went through."""
-        return self._list_of("updates")
-
-    @property
-    def surveyed(self) -> MapDrive:
-        """When the map was surveyed; undated if its file does not say, or nonsense."""
-        return surveyed_in(self.state.provenance)
-
-    @property
-    def origin(self) -> MapOrigin:
-        """What the map was made from, as its file says; what is not like it is left out."""
-        return origin_of(self.state.provenance)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -194,10 +183,6 @@ class SavedMap:
         """Raise a MapError for a drive that is said to be in another frame."""
         refuse_other_frame(self.state.provenance.get("frame"), drive, str(self.path))
 
-    def _list_of(self, name: str) -> list[Any]:
-        entries = self.state.provenance.get(name)
-        return entries if isinstance(entries, list) else []
-
 
 def map_notes(saved: SavedMap, field_map: FieldMap) -> tuple[str, ...]:
     """Return what whoever uses a map has to know of it, by itself and by its file, as notes."""
@@ -208,6 +193,12 @@ def used_file(path: Path, judgement: Level | None) -> dict[str, Any]:
     """Return what a map's file says of a calibration that it was made with."""
     verdict = {"verdict": Level.FAIL.value} if judgement is Level.FAIL else {}
     return {**vars(source_file(path)), **verdict}
+
+
+def entries_of(provenance: dict[str, Any], name: str) -> list[Any]:
+    """Return a list in what a map's file says, which may have been tampered with; empty if none."""
+    entries = provenance.get(name)
+    return entries if isinstance(entries, list) else []
 
 
 def surveyed_in(provenance: dict[str, Any]) -> MapDrive:
@@ -227,12 +218,10 @@ def origin_of(provenance: dict[str, Any]) -> MapOrigin:
     provenance
         What the file of a map says of itself; it may have been tampered with.
     """
-    updates = provenance.get("updates")
-    later = updates if isinstance(updates, list) else []
-    bags = provenance.get("bags")
-    files = [("survey", each) for each in (bags if isinstance(bags, list) else [])]
+    later = [part for part in entries_of(provenance, "updates") if isinstance(part, dict)]
+    files = [("survey", each) for each in entries_of(provenance, "bags")]
     files += [(name, provenance.get(name)) for name in USED]
-    files += [("suite of an update", part.get("suite")) for part in later if isinstance(part, dict)]
+    files += [("suite of an update", part.get("suite")) for part in later]
     files += [(name, provenance.get(name)) for name in ("structure", "lidar")]
     sources = (
         NamedSource(role, path, sha256)
@@ -252,8 +241,7 @@ def doubts_of_origin(provenance: dict[str, Any]) -> tuple[str, ...]:
     provenance
         What the file of a map says of itself; it may have been tampered with.
     """
-    updates = provenance.get("updates")
-    parts = [provenance, *(updates if isinstance(updates, list) else [])]
+    parts = [provenance, *entries_of(provenance, "updates")]
     found = [part.get(name) for part in parts if isinstance(part, dict) for name in USED]
     return tuple(
         f"it was made with {each.get('path')}, whose verdict is FAIL"

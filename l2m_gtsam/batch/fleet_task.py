@@ -244,7 +244,7 @@ def open_map(path: Path) -> FleetMap:
     """Open a map, once for all drives on it; whatever happens is the reason of their rows."""
     try:
         saved = SavedMap.read(path)
-        opened = OpenMap.of(saved, saved.open(silent), source_file(path))
+        opened = OpenMap.of(saved, silent)
         return FleetMap(opened, SavedMap(path, replace(saved.state, arrays={})))
     except L2MError as error:
         return FleetMap(None, None, str(error))

@@ -6,7 +6,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder, origin_of, used_file
+from l2m_gtsam.batch.files import (
+    SavedMap,
+    check_outputs,
+    ensure_folder,
+    entries_of,
+    surveyed_in,
+    used_file,
+)
 from l2m_gtsam.batch.survey import MappingDrives, read_survey, scanned_place
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
@@ -14,41 +21,25 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import compare_recordings, update_map
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
-from l2m_gtsam.maps.field_map import FieldMap, MapSummary, Remembering
+from l2m_gtsam.maps.field_map import FieldMap, Remembering
 from l2m_gtsam.progress import Progress, reported
 from l2m_gtsam.records.map_diary import MapDiary
-from l2m_gtsam.records.provenance import MapOrigin
 from l2m_gtsam.storage.map_file import save_map
 from l2m_gtsam.upkeep.kept_map import drive_dates, kept_up
 from l2m_gtsam.upkeep.surveys import map_surveys
 
 
 @dataclass(frozen=True)
-class MapDescription:
-    """A map's figures and where it came from: plain values of its file."""
-
-    summary: MapSummary
-    provenance: dict[str, Any]
-    diary: MapDiary | None = None
-
-    @property
-    def origin(self) -> MapOrigin:
-        """What it was made from, and when."""
-        return origin_of(self.provenance)
-
-    @classmethod
-    def of(cls, field_map: FieldMap, provenance: dict[str, Any]) -> "MapDescription":
-        """Return what a map says of itself, and its file."""
-        diary = field_map.diary if isinstance(field_map, Remembering) else None
-        return cls(field_map.summary, provenance, diary)
-
-
-@dataclass(frozen=True)
-class BuiltMap:
-    """A map and what its file says of it."""
+class DescribedMap:
+    """A map, and where it came from: plain values of its file."""
 
     field_map: FieldMap
-    description: MapDescription
+    provenance: dict[str, Any]
+
+    @property
+    def diary(self) -> MapDiary | None:
+        """What it went through, if it remembers that."""
+        return self.field_map.diary if isinstance(self.field_map, Remembering) else None
 
 
 def build_map_file(
@@ -59,7 +50,7 @@ def build_map_file(
     progress: Progress,
     structure: str | None = None,
     lidar: bool = False,
-) -> BuiltMap:
+) -> DescribedMap:
     """Build a map from mapping bags and write it.
 
     Parameters
@@ -116,7 +107,7 @@ def update_map_file(
     config: Config,
     suite: Path | None,
     progress: Progress,
-) -> BuiltMap:
+) -> DescribedMap:
     """Add the readings of more mapping bags to a map, which keeps its kind and its prior.
 
     Parameters
@@ -155,7 +146,7 @@ def keep_map_file_up(
     config: Config,
     suite: Path | None,
     progress: Progress,
-) -> BuiltMap:
+) -> DescribedMap:
     """Add drives of a calibrated vehicle to a map, and record what has changed since.
 
     Parameters
@@ -193,7 +184,7 @@ def keep_map_file_up(
             drives.survey.suite or {},
             config.mapping,
             config.calibration.changes,
-            drives.saved.surveyed,
+            surveyed_in(drives.saved.state.provenance),
         )
     return drives.write(out, kept, config)
 
@@ -219,7 +210,7 @@ class _AddedDrives:
     def recordings(self) -> list[Recording]:
         return self.survey.recordings
 
-    def write(self, out: Path, updated: FieldMap, config: Config) -> BuiltMap:
+    def write(self, out: Path, updated: FieldMap, config: Config) -> DescribedMap:
         """Write the map with these drives."""
         added = [vars(recording.source) for recording in self.recordings]
         update = {
@@ -228,11 +219,12 @@ class _AddedDrives:
             "config": config.model_dump(mode="json", include={"bag": True, "mapping": {"sync"}}),
             "version": version("l2m-gtsam"),
         }
+        before = self.saved.state.provenance
         provenance = {
-            **self.saved.state.provenance,
+            **before,
             **updated.to_state().provenance,
             "bags": [*self.saved.bags, *added],
-            "updates": [*self.saved.updates, update],
+            "updates": [*entries_of(before, "updates"), update],
             "frame": self.recordings[0].trajectory.frame,
         }
         return write_map(out, updated, provenance, self.saved.state.lidar)
@@ -276,10 +268,10 @@ def compare_map_kinds(
     )
 
 
-def describe_map_file(path: Path, progress: Progress) -> MapDescription:
+def describe_map_file(path: Path, progress: Progress) -> DescribedMap:
     """Return what a map file holds and where it came from."""
     saved = SavedMap.read(path)
-    return MapDescription.of(saved.open(progress), saved.state.provenance)
+    return DescribedMap(saved.open(progress), saved.state.provenance)
 
 
 def plot_map_file(path: Path, out: Path, height: float | None, progress: Progress) -> None:
@@ -296,13 +288,13 @@ def plot_map_file(path: Path, out: Path, height: float | None, progress: Progres
 
 def write_map(
     out: Path, field_map: FieldMap, provenance: dict[str, Any], lidar: LidarMap | None
-) -> BuiltMap:
+) -> DescribedMap:
     """Write a map with where it came from, besides what it says of itself."""
     state = field_map.to_state()
     state = replace(state, provenance={**state.provenance, **provenance}, lidar=lidar)
     ensure_folder(out.parent)
     save_map(out, state)
-    return BuiltMap(field_map, MapDescription.of(field_map, state.provenance))
+    return DescribedMap(field_map, state.provenance)
 
 
 def _check_new(

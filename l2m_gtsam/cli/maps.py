@@ -17,7 +17,7 @@ from l2m_gtsam.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from l2m_gtsam.batch.maps import MapDescription
+    from l2m_gtsam.batch.maps import DescribedMap
 
 map_app = typer.Typer(
     help="Build, update, compare, describe and draw magnetic maps; calibrate a mapping suite.",
@@ -117,8 +117,8 @@ def map_build(
         built = build_map_file(bags, out, chosen, suite, progress, structure, lidar)
         if tiles:
             make_tiles(built.field_map, out, progress)
-    _print_map(built.description)
-    warn(built.description.summary.doubts)
+    _print_map(built)
+    warn(built.field_map.summary.doubts)
     say(f"written: {out}")
 
 
@@ -155,19 +155,19 @@ def map_update(
         updated = update(map_path, bags, out, chosen, suite, progress)
         if tiles:
             make_tiles(updated.field_map, out, progress)
-    _print_map(updated.description)
-    warn(updated.description.summary.doubts)
+    _print_map(updated)
+    warn(updated.field_map.summary.doubts)
     say(f"written: {out}")
 
 
-def _print_map(description: "MapDescription") -> None:
+def _print_map(described: "DescribedMap") -> None:
     """Print what a map is, and what changed since its survey."""
     from l2m_gtsam.cli.tables.maps import changes_table, faded_lines, map_table
 
-    print_table(map_table(description))
-    if description.diary is not None:
-        print_table(changes_table(description.diary))
-        say(*faded_lines(description.diary))
+    print_table(map_table(described))
+    if described.diary is not None:
+        print_table(changes_table(described.diary))
+        say(*faded_lines(described.diary))
 
 
 @map_app.command("compare")
@@ -198,9 +198,9 @@ def map_info(map_path: MapArgument) -> None:
         from l2m_gtsam.batch.files import doubts_of_origin
         from l2m_gtsam.batch.maps import describe_map_file
 
-        description = describe_map_file(map_path, progress)
-    _print_map(description)
-    warn([*description.summary.doubts, *doubts_of_origin(description.provenance)])
+        described = describe_map_file(map_path, progress)
+    _print_map(described)
+    warn([*described.field_map.summary.doubts, *doubts_of_origin(described.provenance)])
 
 
 @map_app.command("plot")

@@ -1,12 +1,11 @@
 """Magnetic maps in the terminal: content of one, its changes, and kinds of maps compared."""
 
-from typing import Any
-
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.batch.maps import MapDescription
+from l2m_gtsam.batch.files import entries_of, origin_of
+from l2m_gtsam.batch.maps import DescribedMap
 from l2m_gtsam.cli.tables import add_numbers, add_text, new_table, plain_table, vector_cell
 from l2m_gtsam.maps.compare import KindFigures, KindResult, MapComparison
 from l2m_gtsam.qa.report.facts import period
@@ -77,9 +76,9 @@ def _cells(figures: KindFigures) -> tuple[str, ...]:
     )
 
 
-def map_table(description: MapDescription) -> Table:
+def map_table(described: DescribedMap) -> Table:
     """Return what a map is made of, what it covers and where it came from."""
-    summary = description.summary
+    summary = described.field_map.summary
     table = plain_table("Magnetic map")
     for heading in ("fact", "value"):
         table.add_column(heading)
@@ -91,25 +90,20 @@ def map_table(description: MapDescription) -> Table:
         shown = f"{value:.4g}" if isinstance(value, float) else str(value)
         table.add_row(escape(name), escape(shown))
     for name in ("frame", "version"):
-        table.add_row(name, escape(str(description.provenance.get(name, "unknown"))))
-    for source in _bags(description.provenance):
-        table.add_row("made from", escape(", ".join(str(value) for value in source.values())))
-    origin = description.origin
+        table.add_row(name, escape(str(described.provenance.get(name, "unknown"))))
+    for source in entries_of(described.provenance, "bags"):
+        if isinstance(source, dict):
+            table.add_row("made from", escape(", ".join(str(value) for value in source.values())))
+    origin = origin_of(described.provenance)
     table.add_row("surveyed", escape(period(origin.surveyed)))
     for each in origin.sources:
         if each.role.startswith(("suite", "calibration")):
             table.add_row(escape(each.role), escape(f"{each.path}, {each.sha256}"))
     for name, shown in (("structure", "structure"), ("lidar", "cloud of scans")):
-        if isinstance(parts := description.provenance.get(name), dict):
+        if isinstance(parts := described.provenance.get(name), dict):
             facts = (f"{part.replace('_', ' ')} {value}" for part, value in parts.items())
             table.add_row(shown, escape(", ".join(facts)))
     return table
-
-
-def _bags(provenance: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the bags in a map file, which may have been tampered with."""
-    bags = provenance.get("bags")
-    return [each for each in bags if isinstance(each, dict)] if isinstance(bags, list) else []
 
 
 def changes_table(diary: MapDiary) -> Table:
