@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from l2m_gtsam.batch.files import check_outputs, ensure_folder, saved_options
-from l2m_gtsam.config import load_config
+from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.data import CorrectedField, FloatArray, IntArray, ScalarSeries
 from l2m_gtsam.errors import BagError, CalibrationError, ConfigError, OutputError
 from l2m_gtsam.progress import Progress, counter
@@ -19,7 +20,6 @@ from l2m_gtsam.storage.bag_copy import bag_copy, check_copy
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.calibrated_topics import (
-    CalibratedTopic,
     Calibrator,
     Correct,
     Key,
@@ -161,39 +161,6 @@ def _edited(export: Export, urdf: Path) -> bytes:
     return edited_urdf(export, str(urdf), read_content(urdf, MAX_URDF_BYTES, ConfigError))
 
 
-@dataclass(frozen=True)
-class Reading:
-    """How readings, and numbers that they follow, get out of a bag."""
-
-    bag: BagOptions
-    resampling: ResampleOptions
-
-    @classmethod
-    def from_config(cls, path: Path) -> "Reading":
-        """Return what a configuration says."""
-        config = load_config(path)
-        return cls(config.bag, config.calibration.regressors)
-
-    @classmethod
-    def of(cls, result: CalibrationResult, path: Path) -> "Reading":
-        """Return how the drive of a calibration was read.
-
-        Parameters
-        ----------
-        path
-            Its file, for messages.
-
-        Raises
-        ------
-        CalibrationError
-            Its options are not understood.
-        """
-        return cls(
-            saved_options(path, result.options, BagOptions, "bag"),
-            saved_options(path, result.options, ResampleOptions, "calibration", "regressors"),
-        )
-
-
 def not_applicable(sensor: SensorCalibration) -> str | None:
     """Return why the readings of a sensor cannot be corrected."""
     if (reason := not_correctable(sensor)) is not None:
@@ -203,7 +170,7 @@ def not_applicable(sensor: SensorCalibration) -> str | None:
 
 
 def corrections_of(
-    bag: Path, sensors: Sequence[SensorCalibration], reading: Reading, progress: Progress
+    bag: Path, sensors: Sequence[SensorCalibration], config: Config, progress: Progress
 ) -> dict[str, Correct]:
     """Return what corrects sensors of a bag, by their names.
 
@@ -213,7 +180,7 @@ def corrections_of(
         The bag; numbers that readings follow are read out of it.
     sensors
         Sensors whose readings can be corrected.
-    reading
+    config
         How the bag is read.
     progress
         Called with a stage and the fraction of it that is done.
@@ -225,24 +192,25 @@ def corrections_of(
     BagError
         It is not in the bag.
     """
+    own = config.bag
     names = sorted({moving.name for sensor in sensors for moving in sensor.moving})
-    if missing := [name for name in names if name not in reading.bag.regressors]:
+    if missing := [name for name in names if name not in own.regressors]:
         raise ConfigError(
             f"a part of the readings follows {missing[0]!r}, which `bag.regressors` does not name; "
             "say in --config where it is recorded"
         )
-    topics = {name: reading.bag.regressors[name] for name in names}
+    topics = {name: own.regressors[name] for name in names}
     count = counter(f"reading numbers of {bag.name}", progress)
-    scalars = read_scalars(bag, topics, reading.bag.stamps, count, reading.bag.columns)
-    series = {each.name: each for each in scalars}
+    scalars = read_scalars(bag, topics, own.stamps, count, own.columns)
+    series, resampling = {each.name: each for each in scalars}, config.calibration.regressors
     return {
-        sensor.sensor: _correction(sensor, [series[m.name] for m in sensor.moving], reading)
+        sensor.sensor: _correction(sensor, [series[m.name] for m in sensor.moving], resampling)
         for sensor in sensors
     }
 
 
 def _correction(
-    sensor: SensorCalibration, numbers: Sequence[ScalarSeries], reading: Reading
+    sensor: SensorCalibration, numbers: Sequence[ScalarSeries], resampling: ResampleOptions
 ) -> Correct:
     """Return what takes a sensor's moving fields out of its readings, and then C and H."""
     covariance = np.array(sensor.covariance[3:, 3:])
@@ -250,7 +218,7 @@ def _correction(
     h_sigma = np.array([moving.sigma for moving in sensor.moving]).reshape(-1, 3)
 
     def correct(readings: FloatArray, stamp_ns: IntArray) -> CorrectedField:
-        at = resampled(numbers, stamp_ns, reading.resampling)
+        at = resampled(numbers, stamp_ns, resampling)
         still = without_moving(readings, at.values, h)
         still[~at.known] = np.nan
         variance = sensor.noise**2 + moving_variance(at.values, h_sigma)
@@ -323,33 +291,41 @@ def apply_calibration(wanted: Application, progress: Progress) -> Applied:
     """
     result = read_sensors(wanted.calibration)
     judged = verdict_notes(wanted.calibration, result, wanted.despite_verdict)
-    if wanted.config is None:
-        reading = Reading.of(result, wanted.calibration)
-    else:
-        reading = Reading.from_config(wanted.config)
+    config = _config(wanted, result)
     usable = usable_sensors(result, not_applicable)
     check_lidar_frame(wanted.lidar_frame)
     with open_bag(wanted.bag) as bag:
         check_copy(bag, wanted.out)
         name = wanted.bag.name
-        found = sensor_topics(bag, reading.bag, counter(f"reading {name}", progress))
+        found = sensor_topics(bag, config.bag, counter(f"reading {name}", progress))
         names = {each.sensor for each in found.values()}
         here = [sensor for sensor in usable.sensors if sensor.sensor in names]
-        corrections = corrections_of(wanted.bag, here, reading, progress)
-        topics = _calibrated_topics(bag, found, corrections, reading.bag)
+        corrections = corrections_of(wanted.bag, here, config, progress)
+        topics = _calibrated_topics(bag, found, corrections, config.bag)
         left_out = frozenset(topic for topic, _ in topics) if wanted.replace else frozenset()
         calibrator = Calibrator(
             bag=bag,
             topics=topics,
-            options=reading.bag,
+            corrections=corrections,
+            options=config.bag,
             frame=wanted.lidar_frame,
             left_out=left_out,
             verdict=verdict_text(result, source_file(wanted.calibration)),
         )
         with bag_copy(bag, wanted.out) as copy:
             calibrator.copy(copy, counter(f"copying {name}", progress))
-    added = {found[key].sensor: new.topic for key, new in topics.items()}
+    added = {new.sensor: new.topic for new in topics.values()}
     return Applied(added, (*judged, *usable.notes, *_unmatched(result, found)))
+
+
+def _config(wanted: Application, result: CalibrationResult) -> Config:
+    """Return the configuration that is given, or how the drive of the calibration was read."""
+    if wanted.config is not None:
+        return load_config(wanted.config)
+    path, options = wanted.calibration, result.options
+    bag = saved_options(path, options, BagOptions, "bag")
+    resampling = saved_options(path, options, ResampleOptions, "calibration", "regressors")
+    return Config(bag=bag, calibration=CalibrationOptions(regressors=resampling))
 
 
 def _calibrated_topics(
@@ -357,24 +333,21 @@ def _calibrated_topics(
     found: Mapping[Key, SensorTopic],
     corrections: Mapping[str, Correct],
     options: BagOptions,
-) -> dict[Key, CalibratedTopic]:
+) -> dict[Key, SensorTopic]:
     """Return what is added for each sensor of the bag that is calibrated."""
-    keys = [key for key in found if found[key].sensor in corrections]
-    if not keys:
+    topics = {key: each for key, each in found.items() if each.sensor in corrections}
+    if not topics:
         there = ", ".join(sorted(each.sensor for each in found.values()))
         raise BagError(
             f"{bag.path}: the calibration can correct none of its sensors "
             f"({there or 'no readings'})"
         )
     taken = {connection.topic for connection in bag.connections}
-    for key in keys:
-        if found[key].topic in taken:
-            raise BagError(f"{bag.path}: has a topic {found[key].topic} already")
-        check_units(bag, key, found[key], options)
-    names = {key: found[key].sensor for key in keys}
-    return {
-        key: CalibratedTopic(names[key], found[key].topic, corrections[names[key]]) for key in keys
-    }
+    for key, each in topics.items():
+        if each.topic in taken:
+            raise BagError(f"{bag.path}: has a topic {each.topic} already")
+        check_units(bag, key, each, options)
+    return topics
 
 
 def _unmatched(result: CalibrationResult, found: Mapping[Key, SensorTopic]) -> tuple[str, ...]:

@@ -94,25 +94,6 @@ def check_units(bag: Bag, key: Key, found: SensorTopic, options: BagOptions) -> 
         raise UnitsError(f"{bag.path}: topic {key[0]}: {wrong}")
 
 
-@dataclass(frozen=True)
-class CalibratedTopic:
-    """Corrected readings of one sensor.
-
-    Attributes
-    ----------
-    sensor
-        Its name.
-    topic
-        Their name.
-    correct
-        What makes them.
-    """
-
-    sensor: str
-    topic: str
-    correct: Correct
-
-
 @dataclass
 class Calibrator:
     """Copies a bag and puts corrected readings beside those of its magnetometers.
@@ -123,6 +104,8 @@ class Calibrator:
         The source.
     topics
         What is added, by topic and frame of the sensors.
+    corrections
+        What makes them of readings, by the names of the sensors.
     options
         How readings are read.
     frame
@@ -134,7 +117,8 @@ class Calibrator:
     """
 
     bag: Bag
-    topics: Mapping[Key, CalibratedTopic]
+    topics: Mapping[Key, SensorTopic]
+    corrections: Mapping[str, Correct]
     options: BagOptions
     frame: str
     left_out: frozenset[str]
@@ -196,7 +180,7 @@ class Calibrator:
             stamps = [self._stamp(block[row], contents[row]) for row in rows[key]]
             field_ut = unit * _readings([contents[row] for row in rows[key]])
             field_ut = self.options.in_order(new.sensor, field_ut)
-            result = new.correct(field_ut, np.array(stamps, dtype=np.int64))
+            result = self.corrections[new.sensor](field_ut, np.array(stamps, dtype=np.int64))
             for row, b, spread in zip(rows[key], result.field, result.covariance, strict=True):
                 message = self._message(contents[row], b, spread)
                 codec = self._codecs[block[row].connection.id]
