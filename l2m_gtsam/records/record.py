@@ -93,8 +93,8 @@ class Record:
         return tuple(sorted(found, key=lambda each: "+" in each[1].text))
 
 
-def fields_of(record: Record, kind: type[Record]) -> dict[str, Any]:
-    """Return the fields of a record that it has from one of its base classes, by name."""
+def fields_of(record: object, kind: type[Any]) -> dict[str, Any]:
+    """Return the fields of a dataclass that it has from one of its base classes, by name."""
     return {each.name: getattr(record, each.name) for each in fields(kind)}
 
 

@@ -1,7 +1,7 @@
 """``calibration.yaml``: everything about each sensor, with formulas and units inside."""
 
 import json
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from l2m_gtsam.records.calibration import (
     Uncertainty,
 )
 from l2m_gtsam.records.error_budget import EXPLAINED
+from l2m_gtsam.records.record import fields_of
 from l2m_gtsam.records.verdict import NOT_JUDGED, Judgement
 from l2m_gtsam.storage.report_id import checked_id, with_id
 from l2m_gtsam.storage.result_set import check_set
@@ -157,6 +158,7 @@ SENSOR_KEYS = (
     *("unmodelled", "variance_shares", "common", "covariance"),
 )
 """In the order of the file; the matrix of 15 rows comes last, since it hides what follows it."""
+SENSOR_OPTIONAL = ("missing_in", "drive_noise", "unmodelled", "variance_shares", "common")
 
 
 @dataclass(frozen=True)
@@ -187,10 +189,7 @@ def calibration_content(result: CalibrationResult) -> dict[str, Any]:
     """Return all that the file of a calibration says, plain values with the id of them."""
     plain = _RESULT.dump_python(result, exclude={"sensors"})
     judged = {} if result.judgement is None else {"verdict": verdict_entry(result.judgement)}
-    disagreements = [
-        _without_empty(_without_empty(each, "bag"), "explanations")
-        for each in plain["disagreements"]
-    ]
+    stretches = plain["disagreements"]
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -198,16 +197,14 @@ def calibration_content(result: CalibrationResult) -> dict[str, Any]:
         **judged,
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
         **{name: plain[name] for name in ABOUT_ERRORS},
-        "disagreements": disagreements,
+        "disagreements": [_without_empty(each, "bag", "explanations") for each in stretches],
         "sources": plain["sources"],
         **source_entries(result),
         **{name: plain[name] for name in ABOUT_ORIGIN},
         "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
         "options": plain["options"],
     }
-    for name in OPTIONAL:
-        content = _without_empty(content, name)
-    return with_id(content, "version")
+    return with_id(_without_empty(content, *OPTIONAL), "version")
 
 
 def read_calibration(path: Path) -> CalibrationResult:
@@ -230,8 +227,7 @@ def calibration_in(path: Path, content: Any) -> CalibrationResult:
             f"{path}: verdict.level: {found.judgement.verdict.level.upper()} does not follow from "
             "its reasons; it was edited: calibrate again"
         )
-    names = [each.name for each in fields(CalibrationResult)]
-    result = CalibrationResult(**{name: getattr(found, name) for name in names})
+    result = CalibrationResult(**fields_of(found, CalibrationResult))
     return replace(result, report_id=checked_id(path, content, CalibrationError))
 
 
@@ -293,12 +289,8 @@ def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
     }
     if sensor.unmodelled == EXPLAINED:
         values["unmodelled"] = None
-    for name in ("saturated", "limits", "elsewhere"):
-        values["readings"] = _without_empty(values["readings"], name)
-    entry = {key: values[key] for key in SENSOR_KEYS}
-    for name in ("missing_in", "drive_noise", "unmodelled", "variance_shares", "common"):
-        entry = _without_empty(entry, name)
-    return entry
+    values["readings"] = _without_empty(values["readings"], "saturated", "limits", "elsewhere")
+    return _without_empty({key: values[key] for key in SENSOR_KEYS}, *SENSOR_OPTIONAL)
 
 
 def source_entries(result: CalibrationResult) -> dict[str, Any]:
@@ -307,8 +299,8 @@ def source_entries(result: CalibrationResult) -> dict[str, Any]:
     return _without_empty({name: plain[name] for name in ("bag", "bags", "map")}, "bags")
 
 
-def _without_empty(entry: dict[str, Any], name: str) -> dict[str, Any]:
-    return {key: value for key, value in entry.items() if value or key != name}
+def _without_empty(entry: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if value or key not in names}
 
 
 def _time_offset(plain: dict[str, Any] | None, sensor: SensorCalibration) -> dict[str, Any] | None:
