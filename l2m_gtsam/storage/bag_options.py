@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform
@@ -21,6 +21,12 @@ RegressorName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,99}$")]
 """Letters, digits and underscores, a letter first."""
 
 
+def _not_nothing(scale: float) -> float:
+    if scale == 0:
+        raise ValueError("a scale of 0 leaves nothing of the number")
+    return scale
+
+
 class RegressorTopic(Options):
     """Where a number is found that goes along with a drive."""
 
@@ -29,15 +35,8 @@ class RegressorTopic(Options):
     field: str = Field(default="data", pattern=PATH)
     """Where the number is in a message: names with dots between, an element of an array with
     its index, for example `current`, `twist.twist.linear.x` or `data[2]`."""
-    scale: float = 1.0
+    scale: Annotated[float, AfterValidator(_not_nothing)] = 1.0
     """Factor on the number; coefficients are in microtesla per unit of the product."""
-
-    @field_validator("scale")
-    @classmethod
-    def _not_nothing(cls, scale: float) -> float:
-        if scale == 0:
-            raise ValueError("a scale of 0 leaves nothing of the number")
-        return scale
 
 
 class Stamps(StrEnum):

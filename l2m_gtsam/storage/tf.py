@@ -116,22 +116,23 @@ def chain_frames(links: Iterable[tuple[str, str]], ends: tuple[str, str]) -> set
         Of the chain.
     """
     parents = {child: parent for parent, child in links}
-    return _ancestors(parents, ends[0]) | _ancestors(parents, ends[1])
+    return {frame for end in ends for frame in _ancestry(parents, end)}
 
 
-def _ancestors(parents: dict[str, str], frame: str) -> set[str]:
+def _ancestry(parents: dict[str, str], frame: str) -> list[str]:
     """Return a frame and all above it that have a parent; stops where a chain bites its tail."""
-    found: set[str] = set()
+    found: list[str] = []
     while frame in parents and frame not in found:
-        found.add(frame)
+        found.append(frame)
         frame = parents[frame]
     return found
 
 
 def _chain(links: dict[str, Link], frame: str, child_frame: str, where: str) -> list[Link]:
     """Return the links from ``frame`` down to ``child_frame``, over their common ancestor."""
-    down, up = _ancestry(links, child_frame), _ancestry(links, frame)
-    known = sorted({*links, *(link.parent for link in links.values())})
+    parents = {child: link.parent for child, link in links.items()}
+    down, up = ([links[each] for each in _ancestry(parents, end)] for end in (child_frame, frame))
+    known = sorted({*parents, *parents.values()})
     ancestors = [frame, *(link.parent for link in up)]
     for depth, meeting in enumerate([child_frame, *(link.parent for link in down)]):
         if meeting in ancestors:
@@ -141,12 +142,3 @@ def _chain(links: dict[str, Link], frame: str, child_frame: str, where: str) -> 
         f"{where}: no tf chain from {frame!r} to {child_frame!r}; the bag has the frames "
         f"{', '.join(known) or '(none)'}"
     )
-
-
-def _ancestry(links: dict[str, Link], frame: str) -> list[Link]:
-    """Return the links from a frame up to its root; stops where a chain bites its tail."""
-    found: list[Link] = []
-    while frame in links and len(found) < len(links):
-        found.append(links[frame])
-        frame = links[frame].parent
-    return found
