@@ -27,10 +27,9 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.plan import DrivePlan
 from l2m_gtsam.storage.bag import has_fields, read_trajectory
-from l2m_gtsam.storage.bag_report import BagReport
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.files import source_file
-from l2m_gtsam.storage.inspect import inspect_bag
+from l2m_gtsam.storage.inspect import BagReport, inspect_bag
 from l2m_gtsam.storage.record_files import write_metrics
 from l2m_gtsam.storage.rerun_file import require_rerun, write_scene
 from l2m_gtsam.storage.result_set import published

@@ -11,8 +11,7 @@ from ruamel.yaml import YAML
 from l2m_gtsam.config import Config
 from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_options import BagOptions, PoseFileOptions
-from l2m_gtsam.storage.bag_report import POSE_FILE, BagReport, TopicReport
-from l2m_gtsam.storage.inspect import inspect_bag
+from l2m_gtsam.storage.inspect import POSE_FILE, BagReport, TopicReport, inspect_bag
 from l2m_gtsam.storage.messages import ALL_POSE_TYPES, TF_TYPES
 from l2m_gtsam.storage.units import EARTH_UT, Unit
 from l2m_gtsam.text import shown

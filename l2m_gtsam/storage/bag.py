@@ -22,7 +22,6 @@ from l2m_gtsam.storage.log import Log, Message
 from l2m_gtsam.storage.messages import (
     ALL_POSE_TYPES,
     PATH_TYPE,
-    POSE_TYPES,
     TF_TYPES,
     FieldBuffer,
     PoseBuffer,
@@ -30,6 +29,7 @@ from l2m_gtsam.storage.messages import (
     frame_of,
     header_ns,
     stamp_of,
+    stamped_poses,
 )
 from l2m_gtsam.storage.open_bag import Bag
 from l2m_gtsam.storage.open_log import open_log
@@ -49,13 +49,12 @@ from l2m_gtsam.storage.units import field_fault, microtesla_per
 class Buffers:
     """Everything that one pass over a bag collects.
 
-    Fields by topic and frame, poses of a topic by frame and child frame, links of tf by
-    parent and child; both times of messages by topic of a field, and by ends of poses and links.
+    Fields by topic and frame, poses of a topic or of tf by frame and child frame; both times of
+    messages by topic of a field, and by ends of poses.
     """
 
     fields: dict[tuple[str, str], FieldBuffer] = field(default_factory=dict)
     poses: dict[tuple[str, str], PoseBuffer] = field(default_factory=dict)
-    links: dict[tuple[str, str], PoseBuffer] = field(default_factory=dict)
     field_times: dict[str, StampBuffer] = field(default_factory=dict)
     pose_times: dict[tuple[str, str], StampBuffer] = field(default_factory=dict)
 
@@ -177,10 +176,8 @@ def _read(
         if message.connection.id in sources:
             for source in sources[message.connection.id]:
                 _add_field(bag.path, buffers, message, source, options)
-        elif message.connection.msgtype in TF_TYPES:
-            _add_transforms(buffers, message, options)
         else:
-            _add_pose(buffers, message, options)
+            _add_poses(buffers, message, options)
     return buffers
 
 
@@ -207,44 +204,33 @@ def _add_field(
     buffers.fields[label, frame].add(message.stamp_ns(options.stamps), reading)
 
 
-def _add_pose(buffers: Buffers, message: Message, options: BagOptions) -> None:
-    content = message.content
-    pose = POSE_TYPES[message.connection.msgtype](content)
-    frame = frame_of(content) if hasattr(content, "header") else "map"
-    ends = frame, pose.child_frame or "lidar"
-    if ends not in buffers.poses:
-        buffers.poses[ends] = PoseBuffer(*ends)
-    times = buffers.pose_times.setdefault(ends, StampBuffer())
-    times.add(stamp_of(content, message.record_ns), message.record_ns)
-    buffer, stamp = buffers.poses[ends], message.stamp_ns(options.stamps)
-    buffer.add(stamp, pose.position, pose.orientation, pose.covariance)
-
-
-def _add_transforms(buffers: Buffers, message: Message, options: BagOptions) -> None:
-    static = "tf_static" in message.connection.topic
-    for item in message.content.transforms:
-        parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
-        if (parent, child) not in buffers.links:
-            buffers.links[parent, child] = PoseBuffer(parent, child, static=static)
-        buffer = buffers.links[parent, child]
-        times = buffers.pose_times.setdefault((parent, child), StampBuffer())
-        times.add(header_ns(item), message.record_ns)
-        stamp = _stamp(message, item, options)
-        buffer.add(stamp, item.transform.translation, item.transform.rotation)
+def _add_poses(buffers: Buffers, message: Message, options: BagOptions) -> None:
+    msgtype, record_ns = message.connection.msgtype, message.record_ns
+    is_tf = msgtype in TF_TYPES
+    for stamped, pose in stamped_poses(message.content, msgtype):
+        if is_tf:
+            ends = frame_of(stamped).lstrip("/"), pose.child_frame.lstrip("/")
+        else:
+            frame = frame_of(stamped) if hasattr(stamped, "header") else "map"
+            ends = frame, pose.child_frame or "lidar"
+        if ends not in buffers.poses:
+            static = is_tf and "tf_static" in message.connection.topic
+            buffers.poses[ends] = PoseBuffer(*ends, static=static)
+        taken = stamp_of(stamped, record_ns)
+        buffers.pose_times.setdefault(ends, StampBuffer()).add(taken, record_ns)
+        stamp = record_ns if options.stamps is Stamps.RECORD else taken
+        buffers.poses[ends].add(stamp, pose.position, pose.orientation, pose.covariance)
 
 
 def _clocks(path: Path, buffers: Buffers, options: BagOptions) -> tuple[str, ...]:
     """Return what is worth a warning of the clocks behind header stamps, where these count."""
     if options.stamps is Stamps.RECORD:
         return ()
-    chain = () if options.tf is None else chain_frames(buffers.links, options.tf.ends)
-    links = [key for key, link in buffers.links.items() if key[1] in chain and not link.static]
-    poses = [buffers.pose_times[each] for each in links or buffers.poses]
-    return clock_notes(path, poses, buffers.field_times)
-
-
-def _stamp(message: Message, stamped: object, options: BagOptions) -> int:
-    return message.record_ns if options.stamps is Stamps.RECORD else header_ns(stamped)
+    ends = list(buffers.poses)
+    if options.tf is not None:
+        chain = chain_frames(ends, options.tf.ends)
+        ends = [key for key in ends if key[1] in chain and not buffers.poses[key].static]
+    return clock_notes(path, [buffers.pose_times[each] for each in ends], buffers.field_times)
 
 
 def _trajectory(
@@ -285,9 +271,9 @@ def _single(path: Path, buffers: Buffers) -> Trajectory:
 
 def _composed(path: Path, buffers: Buffers, chain: TfChain) -> Trajectory:
     """Return the poses of a chain; a fault in a link beside it does not matter."""
-    needed = chain_frames(buffers.links, chain.ends)
+    needed = chain_frames(buffers.poses, chain.ends)
     links: dict[str, Link] = {}
-    for (parent, child), buffer in buffers.links.items():
+    for (parent, child), buffer in buffers.poses.items():
         if child in needed and child in links:
             raise ValueError(
                 f"tf gives {child!r} two parents, {links[child].parent!r} and {parent!r}"

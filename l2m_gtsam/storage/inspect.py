@@ -1,6 +1,6 @@
 """Say what is in a bag, and what would be used of it and why."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +13,10 @@ from l2m_gtsam.progress import Count
 from l2m_gtsam.recording.pose_order import order_notes
 from l2m_gtsam.recording.saturation import saturated_axes, saturation_sentence
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps
-from l2m_gtsam.storage.bag_report import POSE_FILE, BagReport, TopicReport
 from l2m_gtsam.storage.clocks import UNSTAMPED, set_to_meet
-from l2m_gtsam.storage.field_types import (
-    FIELD_TYPES,
-    VECTOR_TYPE,
-    field_source,
-    is_field,
-)
+from l2m_gtsam.storage.field_types import FIELD_TYPES, VECTOR_TYPE, field_source, is_field
 from l2m_gtsam.storage.log import Log
-from l2m_gtsam.storage.messages import (
-    ALL_POSE_TYPES,
-    PATH_TYPE,
-    POSE_TYPES,
-    TF_TYPES,
-)
+from l2m_gtsam.storage.messages import ALL_POSE_TYPES, PATH_TYPE, POSE_TYPES, TF_TYPES
 from l2m_gtsam.storage.open_log import open_log
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
 from l2m_gtsam.storage.pose_files import read_poses
@@ -38,21 +27,88 @@ from l2m_gtsam.storage.selection import (
     several_frames,
     why_poses,
 )
+from l2m_gtsam.storage.tf import chain_frames
 from l2m_gtsam.storage.topic_content import (
     TopicContent,
     collect_paths,
     collected_topics,
-    needed_frames,
+    pose_fault,
 )
 from l2m_gtsam.storage.units import (
     PLAUSIBLE_UT,
     Strength,
     Unit,
+    Units,
     field_fault,
     likely_units,
     microtesla_per,
     strength,
 )
+
+POSE_FILE = "file"
+"""Type of what stands for a file with poses among topics."""
+
+
+@dataclass(frozen=True)
+class TopicReport:
+    """What is known of one topic.
+
+    Attributes
+    ----------
+    topic, msgtype
+        Name and type.
+    frames
+        Frames of its headers; empty where messages were not decoded.
+    count
+        Messages.
+    rate_hz
+        One over the median time between header stamps; of topics that are not decoded, messages
+        over the time of the bag.
+    longest_gap_s
+        Longest time between messages.
+    span_s
+        First and last header stamp in seconds.
+    use
+        What would be used of it, and why, or why not.
+    clock_offset_s
+        Median of record time less header stamp in seconds.
+    nan_share
+        Share of readings with a NaN axis; NaN for other types.
+    strength
+        |B| in uT, for magnetic fields in a unit that is known.
+    role
+        `field`, `poses` or empty: what it would be used as.
+    likely_units
+        What its readings are likely in, where they are not in the unit of their type.
+    links
+        Parents and children of its transforms.
+    """
+
+    topic: str
+    msgtype: str
+    frames: tuple[str, ...]
+    count: int
+    rate_hz: float
+    longest_gap_s: float
+    span_s: tuple[float, float]
+    use: str
+    clock_offset_s: float = np.nan
+    nan_share: float = np.nan
+    strength: Strength | None = None
+    role: str = ""
+    likely_units: Units | None = None
+    links: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class BagReport:
+    """What is in a bag: its topics, what prevents its use, if anything, and what else to know."""
+
+    path: Path
+    topics: tuple[TopicReport, ...]
+    obstacles: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
 
 BY_CLOUDS = "a map made with `l2m map build --lidar` gives poses to its point clouds"
 
@@ -89,21 +145,24 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
         why = why_poses(other_poses(bag, poses), options)
         uses |= {c.topic: f"poses ({why})" for c in poses}
         topics, duration = _by_topic(bag), max(bag.duration_s, 1e-9)
-        reports = [
+        found = [
             _report(topic, connections, collected.get(topic), uses.get(topic), duration, options)
             for topic, connections in topics.items()
         ]
-        roles = {c.topic: "poses" for c in poses}
-        roles |= {each.connection.topic: "field" for each in fields}
-        reports = [replace(each, role=roles.get(each.topic, "")) for each in reports]
-        reports = _judged_poses(reports, poses, collected, options)
+    roles = {c.topic: "poses" for c in poses}
+    roles |= {each.connection.topic: "field" for each in fields}
+    refused = _refused_poses(poses, collected, options)
+    reports = [
+        replace(each, use=refused.get(each.topic, each.use), role=roles.get(each.topic, ""))
+        for each in found
+    ]
     if no_poses and any(report.msgtype == CLOUD_TYPE for report in reports):
         notes.append(f"{no_poses}; {BY_CLOUDS}")
         no_poses = ""
     if apart is not None:
-        found = read_poses(apart, options.pose_file)
-        reports.append(_pose_file(apart, found, options))
-        notes += order_notes(apart, found)
+        read = read_poses(apart, options.pose_file)
+        reports.append(_pose_file(apart, read, options))
+        notes += order_notes(apart, read)
     obstacles = [reason for reason in (no_fields, no_poses) if reason]
     obstacles += [f"{r.topic}: {r.use}" for r in reports if "refused" in r.use and r.topic in uses]
     used = [collected.get(each.connection.topic) for each in fields]
@@ -116,20 +175,16 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
     return BagReport(path, tuple(reports), tuple(obstacles), tuple(notes))
 
 
-def _judged_poses(
-    reports: list[TopicReport],
-    poses: list[Connection],
-    collected: dict[str, TopicContent],
-    options: BagOptions,
-) -> list[TopicReport]:
-    """Return the same; topics whose poses would be used and cannot be are refused."""
-    checks = {c.topic: collected[c.topic].poses for c in poses if c.topic in collected}
-    needed = needed_frames(checks.values(), options.tf)
-    faults = {topic: check.fault(needed) for topic, check in checks.items()}
-    return [
-        replace(each, use=f"refused: {faults[each.topic]}") if faults.get(each.topic) else each
-        for each in reports
-    ]
+def _refused_poses(
+    poses: list[Connection], collected: dict[str, TopicContent], options: BagOptions
+) -> dict[str, str]:
+    """Return the topics whose poses would be used and cannot be, and why not."""
+    bodies = {c.topic: collected[c.topic].bodies for c in poses if c.topic in collected}
+    needed = None
+    if options.tf is not None:
+        needed = chain_frames([ends for each in bodies.values() for ends in each], options.tf.ends)
+    faults = {topic: pose_fault(each, needed) for topic, each in bodies.items()}
+    return {topic: f"refused: {fault}" for topic, fault in faults.items() if fault}
 
 
 def _pose_file(path: Path, found: Trajectory, options: BagOptions) -> TopicReport:
@@ -143,9 +198,6 @@ def _pose_file(path: Path, found: Trajectory, options: BagOptions) -> TopicRepor
         rate_hz=_rate(gaps, len(found), 0.0),
         longest_gap_s=float(gaps.max()),
         span_s=_span(found.stamp_ns),
-        clock_offset_s=float("nan"),
-        nan_share=float("nan"),
-        strength=None,
         use="poses (of --poses)",
     )
 
@@ -212,13 +264,11 @@ def _report(
         longest_gap_s=float(gaps.max()) if len(gaps) else float("nan"),
         span_s=_span(header),
         clock_offset_s=float(np.median(record - header)) * 1e-9 if len(header) else float("nan"),
-        nan_share=float(np.mean(~np.isfinite(written).all(axis=1)))
-        if len(written)
-        else float("nan"),
+        nan_share=float(np.mean(~np.isfinite(written).all(axis=1))) if len(written) else np.nan,
         strength=_strength(found, options),
         use=_use(use, connections[0], found, options),
         likely_units=likely_units(written, options.units, found.readings.unit),
-        links=tuple(sorted(found.poses.bodies)) if msgtype in TF_TYPES else (),
+        links=tuple(sorted(found.bodies)) if msgtype in TF_TYPES else (),
     )
 
 

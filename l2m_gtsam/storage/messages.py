@@ -1,7 +1,7 @@
 """What is taken out of messages: one table of types, covariances, and growing buffers."""
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -109,6 +109,7 @@ def usable(covariance: FloatArray) -> BoolArray:
     return found
 
 
+TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 TF_TYPES = (TF_TYPE, "tf/msg/tfMessage")
 
@@ -154,7 +155,7 @@ POSE_TYPES: dict[str, Callable[[Any], RawPose]] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: RawPose(
         m.pose.pose.position, m.pose.pose.orientation, "", m.pose.covariance
     ),
-    "geometry_msgs/msg/TransformStamped": lambda m: RawPose(
+    TRANSFORM_TYPE: lambda m: RawPose(
         m.transform.translation, m.transform.rotation, m.child_frame_id
     ),
     CSV_POSE_TYPE: lambda m: RawPose(m.position, m.orientation, ""),
@@ -162,6 +163,14 @@ POSE_TYPES: dict[str, Callable[[Any], RawPose]] = {
 }
 # A path comes last: some repeat where a vehicle was, others are plans of where it shall go.
 ALL_POSE_TYPES = (*POSE_TYPES, PATH_TYPE)
+
+
+def stamped_poses(content: Any, msgtype: str) -> Iterator[tuple[Any, RawPose]]:
+    """Yield what has a stamp in a message, and its pose; nothing of types without poses."""
+    if msgtype in TF_TYPES:
+        yield from ((item, POSE_TYPES[TRANSFORM_TYPE](item)) for item in content.transforms)
+    elif msgtype in POSE_TYPES:
+        yield content, POSE_TYPES[msgtype](content)
 
 
 def px4_pose(position: Any, q: Any) -> RawPose:

@@ -15,7 +15,7 @@ from l2m_gtsam.cli.tables import (
     sigmas_cell,
 )
 from l2m_gtsam.records.plan import DrivePlan, NoiseSource, SensorPlan, Worst
-from l2m_gtsam.storage.bag_report import BagReport, TopicReport
+from l2m_gtsam.storage.inspect import BagReport, TopicReport
 from l2m_gtsam.text import in_unit, sigma_alone
 
 HEADINGS = ("± t (mm)", "± H (uT)", "± rotation (deg)", "± clock (ms)")

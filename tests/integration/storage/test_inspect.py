@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from l2m_gtsam.storage.bag_options import BagOptions, TfChain
-from l2m_gtsam.storage.bag_report import BagReport, TopicReport
-from l2m_gtsam.storage.inspect import inspect_bag
+from l2m_gtsam.storage.inspect import BagReport, TopicReport, inspect_bag
 
 
 def topic(report: BagReport, name: str) -> TopicReport:
