@@ -105,7 +105,7 @@ def calibrate_drive(
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
     metrics = evaluate(recording, found, config.calibration, config.qa, progress)
-    doubts = (*found.result.doubts, *opened.doubts)
+    doubts = (*found.result.doubts, *opened.saved.doubts)
     unjudged = replace(
         found.result,
         options=config.model_dump(mode="json"),

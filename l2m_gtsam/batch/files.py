@@ -104,28 +104,6 @@ def check_bags(bags: Sequence[Path]) -> None:
 
 
 @dataclass(frozen=True)
-class OpenMap:
-    """A map that is ready to be asked, the file that it came from, and what speaks against it."""
-
-    field_map: FieldMap
-    source: SourceFile
-    doubts: tuple[str, ...]
-    origin: MapOrigin
-
-    @classmethod
-    def of(
-        cls, saved: "SavedMap", progress: Progress, drives: Sequence[Recording] = ()
-    ) -> "OpenMap":
-        """Return a map with what its file says of where it came from; see ``SavedMap.open``."""
-        field_map = saved.open(progress, drives)
-        diary = field_map.diary if isinstance(field_map, Remembering) else None
-        later = () if diary is None else diary.drives[1:]
-        updated = later[-1].ended if later else None
-        origin = replace(origin_of(saved.state.provenance), updated=updated)
-        return cls(field_map, source_file(saved.path), saved.doubts, origin)
-
-
-@dataclass(frozen=True)
 class SavedMap:
     """A map file that was read; its map is made when the drives that go with it are known.
 
@@ -182,6 +160,35 @@ class SavedMap:
     def check_frame(self, drive: Recording) -> None:
         """Raise a MapError for a drive that is said to be in another frame."""
         refuse_other_frame(self.state.provenance.get("frame"), drive, str(self.path))
+
+
+@dataclass(frozen=True)
+class OpenMap:
+    """A map that is ready to be asked.
+
+    Attributes
+    ----------
+    saved
+        What its file says of it, without its arrays.
+    source, origin
+        The file, and what the map was made from.
+    """
+
+    saved: SavedMap
+    field_map: FieldMap
+    source: SourceFile
+    origin: MapOrigin
+
+    @classmethod
+    def of(cls, saved: SavedMap, progress: Progress, drives: Sequence[Recording] = ()) -> "OpenMap":
+        """Return a map with what its file says of where it came from; see ``SavedMap.open``."""
+        field_map = saved.open(progress, drives)
+        diary = field_map.diary if isinstance(field_map, Remembering) else None
+        later = () if diary is None else diary.drives[1:]
+        updated = later[-1].ended if later else None
+        origin = replace(origin_of(saved.state.provenance), updated=updated)
+        bare = replace(saved, state=replace(saved.state, arrays={}))
+        return cls(bare, field_map, source_file(saved.path), origin)
 
 
 def map_notes(saved: SavedMap, field_map: FieldMap) -> tuple[str, ...]:

@@ -216,43 +216,22 @@ class FleetTask:
         return RowKey(bag_digest, self.map_digest, self.config_digest, version("l2m-gtsam"))
 
 
-@dataclass(frozen=True)
-class FleetMap:
-    """A map that several drives share.
-
-    Attributes
-    ----------
-    opened
-        The map; absent where it cannot be opened.
-    saved
-        What its file says of it, without its arrays.
-    error
-        Why it cannot be opened.
-    """
-
-    opened: OpenMap | None
-    saved: SavedMap | None
-    error: str = ""
-
-
 def map_of(task: FleetTask) -> Path:
     """Return which map a drive needs."""
     return task.drive.map_path
 
 
-def open_map(path: Path) -> FleetMap:
-    """Open a map, once for all drives on it; whatever happens is the reason of their rows."""
+def open_map(path: Path) -> OpenMap | str:
+    """Open a map, once for all drives on it; what prevents that is the reason of their rows."""
     try:
-        saved = SavedMap.read(path)
-        opened = OpenMap.of(saved, silent)
-        return FleetMap(opened, SavedMap(path, replace(saved.state, arrays={})))
+        return OpenMap.of(SavedMap.read(path), silent)
     except L2MError as error:
-        return FleetMap(None, None, str(error))
+        return str(error)
     except Exception as error:  # one map is not the end of drives on others
-        return FleetMap(None, None, _unexpected(path, error))
+        return _unexpected(path, error)
 
 
-def calibrated_drive(task: FleetTask, shared: FleetMap) -> DriveOutcome:
+def calibrated_drive(task: FleetTask, shared: OpenMap | str) -> DriveOutcome:
     """Calibrate a drive; publish what `l2m calibrate` writes and `outcome.json`, or that alone.
 
     Raises
@@ -274,13 +253,13 @@ def lost_drive(task: FleetTask, reason: str) -> DriveOutcome:
     return _failed(task, f"{task.drive.bag}: {reason}", perf_counter())
 
 
-def _outcome(task: FleetTask, shared: FleetMap, begun: float) -> DriveOutcome:
+def _outcome(task: FleetTask, shared: OpenMap | str, begun: float) -> DriveOutcome:
     """Return what became of a drive; an OutputError if its results cannot be written."""
     check_outputs(*_files(task.out))
     try:
-        if shared.opened is not None and shared.saved is not None:
-            return _calibrated(task, shared.opened, shared.saved, begun)
-        outcome = _failed(task, shared.error, begun)
+        if isinstance(shared, OpenMap):
+            return _calibrated(task, shared, begun)
+        outcome = _failed(task, shared, begun)
     except OutputError:
         raise
     except L2MError as error:
@@ -291,9 +270,9 @@ def _outcome(task: FleetTask, shared: FleetMap, begun: float) -> DriveOutcome:
     return outcome
 
 
-def _calibrated(task: FleetTask, opened: OpenMap, saved: SavedMap, begun: float) -> DriveOutcome:
-    recording = read_drive_on(saved, task.drive.bag, task.config, silent)
-    saved.check_frame(recording)
+def _calibrated(task: FleetTask, opened: OpenMap, begun: float) -> DriveOutcome:
+    recording = read_drive_on(opened.saved, task.drive.bag, task.config, silent)
+    opened.saved.check_frame(recording)
     with calibration_results(task.out) as stage:
         found = calibrate_drive(recording, opened, task.config, stage, silent)
         verdict = report_calibration(stage, found, task.config.qa)

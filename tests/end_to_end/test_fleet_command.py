@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from l2m_gtsam.batch.files import SavedMap
+from l2m_gtsam.batch.files import OpenMap, SavedMap
 from l2m_gtsam.batch.fleet import fleet_tasks
 from l2m_gtsam.batch.fleet_task import RESULTS, calibrated_drive, fleet_drives, open_map
 from l2m_gtsam.maps.field_map import FieldMap
@@ -107,9 +107,8 @@ def test_what_nobody_expects_is_a_row_too(fleet_run: FleetRun, tmp_path: Path) -
     there = fleet_run.copied(tmp_path)
     tasks = fleet_tasks(fleet_drives(there.order), there.out)
     shared = open_map(there.place.map)
-    assert shared.opened is not None
-    nothing_like_a_map = cast("FieldMap", object())
-    none = replace(shared, opened=replace(shared.opened, field_map=nothing_like_a_map))
+    assert isinstance(shared, OpenMap)
+    none = replace(shared, field_map=cast("FieldMap", object()))
     outcome = calibrated_drive(tasks[0], none)
     assert "unexpected AttributeError" in outcome.error
     assert not outcome.lasting
