@@ -1,6 +1,5 @@
 """Read a drive out of a bag: the lidar's poses and every magnetometer's readings."""
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -39,7 +38,6 @@ from l2m_gtsam.storage.selection import (
     select_fields,
     select_poses,
     sensor_names,
-    several_frames,
 )
 from l2m_gtsam.storage.tf import Link, chain_frames, compose
 from l2m_gtsam.storage.units import field_fault, microtesla_per
@@ -293,9 +291,7 @@ def _all_series(
     received = {topic for topic, _ in buffers.fields}
     empty = {(s.label, ""): FieldBuffer(s.label, "") for s in fields if s.label not in received}
     found = {**buffers.fields, **empty}
-    if not options.split_by_frame:
-        _check_frames(path, list(found))
-    names = sensor_names(found, options)
+    names = sensor_names(path, found, options)
     series = tuple(
         _series(path, names[key], found[key], options)
         for key in sorted(found, key=lambda key: names[key])
@@ -304,13 +300,6 @@ def _all_series(
         topics = ", ".join(each.topic for each in series) or "the chosen topics"
         raise BagError(f"{path}: no finite reading in {topics}")
     return series
-
-
-def _check_frames(path: Path, keys: list[tuple[str, str]]) -> None:
-    for topic, count in Counter(topic for topic, _ in keys).items():
-        if count > 1:
-            frames = [frame for each, frame in keys if each == topic]
-            raise BagError(f"{path}: {several_frames(topic, frames)}")
 
 
 def _series(path: Path, name: str, buffer: FieldBuffer, options: BagOptions) -> FieldSeries:

@@ -1,6 +1,6 @@
 """Corrected readings as topics beside those of the magnetometers."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -17,7 +17,7 @@ from l2m_gtsam.storage.bag_options import BagOptions, Stamps
 from l2m_gtsam.storage.field_types import FIELD_TYPE
 from l2m_gtsam.storage.messages import FieldBuffer, header_ns
 from l2m_gtsam.storage.open_bag import Bag, Codec, RawMessage
-from l2m_gtsam.storage.selection import select_fields, sensor_names, several_frames
+from l2m_gtsam.storage.selection import select_fields, sensor_names
 from l2m_gtsam.storage.units import Unit, field_fault, microtesla_per
 
 Correct = Callable[[FloatArray, IntArray], CorrectedField]
@@ -75,15 +75,10 @@ def sensor_topics(bag: Bag, options: BagOptions, progress: Count | None) -> dict
         if len(buffer.stamp_ns) < MOST_JUDGED:
             vector = message.content.magnetic_field
             buffer.add(message.record_ns, (vector.x, vector.y, vector.z))
-    frames: dict[str, list[str]] = defaultdict(list)
-    for topic, frame in buffers:
-        frames[topic].append(frame)
-    for topic, several in frames.items():
-        if len(several) > 1 and not options.split_by_frame:
-            raise BagError(f"{bag.path}: {several_frames(topic, several)}")
-    names = sensor_names(buffers, options)
+    names = sensor_names(bag.path, buffers, options)
+    sensors = Counter(topic for topic, _ in buffers)
     return {
-        key: SensorTopic(names[key], _topic(key, frames), buffer.field())
+        key: SensorTopic(names[key], _topic(key, sensors[key[0]]), buffer.field())
         for key, buffer in buffers.items()
     }
 
@@ -210,10 +205,10 @@ def free_topic(bag: Bag, name: str) -> str:
     return next(each for each in names if each not in taken)
 
 
-def _topic(key: Key, frames: Mapping[str, Sequence[str]]) -> str:
+def _topic(key: Key, sensors: int) -> str:
     """Return the name of the corrected readings; of several sensors, each has its frame in it."""
     topic, frame = key
-    suffix = [frame.strip("/")] if len(frames[topic]) > 1 else []
+    suffix = [frame.strip("/")] if sensors > 1 else []
     return "/".join([topic, *filter(None, suffix), ENDING])
 
 

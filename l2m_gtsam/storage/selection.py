@@ -2,8 +2,9 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from fnmatch import fnmatchcase
+from pathlib import Path
 
 from rosbags.interfaces import Connection
 
@@ -172,18 +173,26 @@ def several_frames(topic: str, frames: Iterable[str]) -> str:
 
 
 def sensor_names(
-    keys: Iterable[tuple[str, str]], options: BagOptions
+    path: Path, keys: Collection[tuple[str, str]], options: BagOptions
 ) -> dict[tuple[str, str], str]:
     """Name the sensors, by topic and frame: the topic without its leading slash, or the frame.
 
     A frame that several topics share, or none, does not identify a sensor: then the topic does,
     with the frame after it.
+
+    Raises
+    ------
+    BagError
+        A topic of the bag, which ``path`` names, has several frames and is not to be split.
     """
-    keys = list(keys)
-    frames = Counter(frame for _, frame in keys)
     by_topic = {(topic, frame): topic.lstrip("/") for topic, frame in keys}
     if not options.split_by_frame:
+        for topic, count in Counter(topic for topic, _ in keys).items():
+            if count > 1:
+                frames_there = [frame for each, frame in keys if each == topic]
+                raise BagError(f"{path}: {several_frames(topic, frames_there)}")
         return by_topic
+    frames = Counter(frame for _, frame in keys)
     return {
         (topic, frame): frame.lstrip("/")
         if frame and frames[frame] == 1
