@@ -11,6 +11,7 @@ fault is reported as a notice, others are not.
 import hashlib
 import json
 import os
+import struct
 import warnings
 from collections.abc import Callable, Collection
 from contextlib import suppress
@@ -23,14 +24,12 @@ import numpy.typing as npt
 
 from l2m_gtsam.errors import ConfigError, MapError, Notice, OutputError
 from l2m_gtsam.maps.tile_store import NO_STORE, Arrays, Entry, Made, TileStore
-from l2m_gtsam.storage.bounded import open_regular
+from l2m_gtsam.storage.bounded import bytes_of, open_regular
 from l2m_gtsam.storage.files import renamed_path
 
 MAGIC = b"l2m-tile"
 VERSION = 1
-NUMBER_BYTES = 8
-CHECKSUM_BYTES = hashlib.sha256().digest_size
-START_BYTES = len(MAGIC) + 2 * NUMBER_BYTES + CHECKSUM_BYTES
+START = struct.Struct("<8sQQ32s")  # that, version, length of the header, checksum
 MOST_BYTES, MOST_HEADER_BYTES = 1 << 28, 1 << 16
 DTYPES = {each.str: each for each in (np.dtype("<f8"), np.dtype("<i8"))}
 
@@ -55,7 +54,7 @@ def write_tile(path: Path, entry: Entry, arrays: Arrays) -> int:
     for each in plain.values():
         digest.update(each.reshape(-1).view(np.uint8).data)
     with renamed_path(path) as temporary, temporary.open("wb") as file:
-        file.write(MAGIC + _number(VERSION) + _number(len(header)) + digest.digest() + header)
+        file.write(START.pack(MAGIC, VERSION, len(header), digest.digest()) + header)
         for each in plain.values():
             file.write(each.reshape(-1).view(np.uint8).data)
         return file.tell()
@@ -101,19 +100,15 @@ def fingerprint_of(path: Path) -> str | None:
 
 def _read_start(file: IO[bytes], size: int) -> tuple[bytes, bytes]:
     """Return checksum and header of a file of so many bytes."""
-    start = file.read(START_BYTES)
-    if len(start) < START_BYTES or not start.startswith(MAGIC):
+    start = file.read(START.size)
+    if len(start) < START.size or not start.startswith(MAGIC):
         raise MapError("it is cut short or no tile")
-    at = len(MAGIC)
-    version, length = (
-        int.from_bytes(start[at + k * NUMBER_BYTES : at + (k + 1) * NUMBER_BYTES], "little")
-        for k in (0, 1)
-    )
+    _, version, length, checksum = START.unpack(start)
     if version != VERSION:
         raise MapError(f"it is of version {version}, not {VERSION}")
-    if size > MOST_BYTES or length > min(MOST_HEADER_BYTES, size - START_BYTES):
+    if size > MOST_BYTES or length > min(MOST_HEADER_BYTES, size - START.size):
         raise MapError("it is cut short or too large")
-    return start[-CHECKSUM_BYTES:], file.read(length)
+    return checksum, file.read(length)
 
 
 def _facts(header: bytes) -> dict[str, Any]:
@@ -134,24 +129,14 @@ def _empty_arrays(facts: dict[str, Any], left: int) -> dict[str, npt.NDArray[Any
             shapes[str(name)] = DTYPES[kind], tuple(int(length) for length in shape)
     except (TypeError, ValueError, KeyError, OverflowError):
         raise MapError("its header is damaged") from None
-    declared = 0
-    for dtype, shape in shapes.values():
-        count = dtype.itemsize
-        for length in shape:
-            if length < 0:
-                raise MapError("its header is damaged")
-            count *= length
-        declared += count
-    if declared != left:
+    if any(length < 0 for _, shape in shapes.values() for length in shape):
+        raise MapError("its header is damaged")
+    if sum(bytes_of(shape, dtype) for dtype, shape in shapes.values()) != left:
         raise MapError("it is cut short or too long")
     try:
         return {name: np.empty(shape, dtype) for name, (dtype, shape) in shapes.items()}
     except (ValueError, OverflowError):  # too many axes, or too long a one beside one of none
         raise MapError("its header is damaged") from None
-
-
-def _number(value: int) -> bytes:
-    return value.to_bytes(NUMBER_BYTES, "little")
 
 
 SUFFIX, FILE_SUFFIX = ".tiles", ".tile"
