@@ -4,16 +4,20 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import ValidationError
 
 from l2m_gtsam.api.results import JudgedCalibration
+from l2m_gtsam.config import fault_in
 from l2m_gtsam.data import KnownSensor, Recording
-from l2m_gtsam.errors import InputError
+from l2m_gtsam.errors import ConfigError, InputError
+from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.text import shown, shown_value
 
+Model = TypeVar("Model", bound=Options)
 READERS = {
     "recording": "read_bag",
     "surveys": "read_bag",
@@ -160,6 +164,16 @@ def pair_of(name: str, value: Any) -> tuple[Any, Any]:
     if not isinstance(value, list | tuple) or len(value) != 2:
         raise refused(name, value, "(stamps, readings)")
     return value[0], value[1]
+
+
+def options_of(model: type[Model], given: Model | Mapping[str, Any] | None, name: str) -> Model:
+    """Return options, defaults where none are given; a ConfigError names the first fault."""
+    if isinstance(given, model):
+        return given
+    try:
+        return model.model_validate({} if given is None else given)
+    except ValidationError as error:
+        raise ConfigError(fault_in(model, error, name)) from error
 
 
 def _all_of(kind: Kind, wanted: str, name: str, value: Any) -> list[Any]:

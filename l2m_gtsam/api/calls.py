@@ -16,12 +16,12 @@ from l2m_gtsam.api.arguments import (
     WHOLE_MAP,
     check,
     drives_of,
+    options_of,
     refuse_paths,
     refused,
     sensors_of,
 )
 from l2m_gtsam.api.arrays import array_of
-from l2m_gtsam.api.options import options_of
 from l2m_gtsam.api.results import JudgedCalibration, LocalisedDrive
 from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.calibration.changed_places import ChangesOptions

@@ -5,8 +5,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from l2m_gtsam.api.arguments import WHOLE_MAP, check, path_of, paths_of
-from l2m_gtsam.api.options import options_of
+from l2m_gtsam.api.arguments import WHOLE_MAP, check, options_of, path_of, paths_of
 from l2m_gtsam.batch.files import SavedMap, read_drive_and_numbers
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.config import Config, with_poses
