@@ -43,17 +43,15 @@ def _entries(
     model: type[BaseModel], values: dict[str, Any] | None, wanted: list[str], indent: str
 ) -> Iterator[str]:
     """Yield the lines of a model; of one that is not there by default, as comments."""
-    fields = {field.alias or name: field for name, field in model.model_fields.items()}
-    if wanted and wanted[0] not in fields:
-        raise ConfigError(f"no option {wanted[0]!r}; there are: {', '.join(fields)}")
-    texts = {
-        field.alias or name: meanings(model)[name] for name, field in model.model_fields.items()
-    }
-    for name, field in fields.items():
-        if wanted and name != wanted[0]:
+    keys = {field.alias or name: name for name, field in model.model_fields.items()}
+    if wanted and wanted[0] not in keys:
+        raise ConfigError(f"no option {wanted[0]!r}; there are: {', '.join(keys)}")
+    for key, name in keys.items():
+        if wanted and key != wanted[0]:
             continue
-        value, given = None if values is None else values[name], values is not None
-        yield from _entry(name, field, value, wanted[1:], indent, texts[name], given=given)
+        field, meaning = model.model_fields[name], meanings(model)[name]
+        value, given = None if values is None else values[key], values is not None
+        yield from _entry(key, field, value, wanted[1:], indent, meaning, given=given)
 
 
 def _entry(
@@ -67,7 +65,7 @@ def _entry(
     given: bool,
 ) -> Iterator[str]:
     """Yield the lines of one option and, where it holds a model, of those inside."""
-    inner = inside_of(field)
+    inner = inside_of(field.annotation)
     kind = "" if inner else f" ({kind_of(field.annotation)}{limits_of(field)})"
     if not wanted:
         # A line without end would be no line: words of a name that has to stay whole.
@@ -135,7 +133,7 @@ def _sections(model: type[BaseModel], prefix: str, values: BaseModel | None) -> 
         # Names with dots get an anchor of their own: no two programs agree on that of a heading.
         anchor = f'<a id="{prefix}"></a>\n\n' if {".", "["} & set(prefix) else ""
         yield f"\n{anchor}## `{prefix}`\n\n{_text(model.__doc__ or '')}\n"
-    nested = {name: inside_of(field) for name, field in model.model_fields.items()}
+    nested = {name: inside_of(field.annotation) for name, field in model.model_fields.items()}
     rows = [_row(model, name, values) for name, inside in nested.items() if inside is None]
     if rows:
         yield f"\n| key | value | default | meaning |\n|---|---|---|---|\n{''.join(rows)}"
@@ -166,17 +164,13 @@ class InnerModel:
     through: str
 
 
-def inside_of(field: FieldInfo) -> InnerModel | None:
-    """Return the model that an option holds, if it holds one."""
-    return _model_of(field.annotation)
-
-
-def _model_of(annotation: Any) -> InnerModel | None:
+def inside_of(annotation: Any) -> InnerModel | None:
+    """Return the model that an option of this type holds, if it holds one."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return InnerModel(annotation, "")
     through = {dict: ".NAME", tuple: "[]", list: "[]"}.get(get_origin(annotation), "")
     for each in get_args(annotation):
-        if inner := _model_of(each):
+        if inner := inside_of(each):
             return InnerModel(inner.model, through + inner.through)
     return None
 

@@ -35,7 +35,7 @@ def described(model: type[BaseModel]) -> list[str]:
     found = []
     for name, field in model.model_fields.items():
         found.append(" ".join(meanings(model)[name].split()[:3]))
-        if inner := inside_of(field):
+        if inner := inside_of(field.annotation):
             found += described(inner.model)
     return found
 
