@@ -438,9 +438,7 @@ class FieldSample:
 
     def select(self, keep: BoolArray) -> "FieldSample":
         """Return what it says at some of the points, shape (N,)."""
-        return FieldSample(
-            self.field[keep], self.gradient[keep], self.variance[keep], self.inside[keep]
-        )
+        return chosen_rows(self, keep)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.batch.software import versions
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.config import Config, load_config, with_poses
-from l2m_gtsam.data import SourceFile
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.metrics.changes import compare_calibrations, is_calibrated
@@ -204,8 +203,7 @@ def _tested(
 
 
 def _source(role: str, path: Path) -> NamedSource:
-    found: SourceFile = source_file(path)
-    return NamedSource(role, found.path, found.sha256)
+    return NamedSource(role, **vars(source_file(path)))
 
 
 def _write(folder: Path, found: Validation) -> None:

@@ -24,6 +24,7 @@ from l2m_gtsam.data import (
     SyncCounts,
     Synchronised,
     Trajectory,
+    chosen_rows,
     joined_rows,
 )
 from l2m_gtsam.errors import CalibrationError
@@ -239,25 +240,22 @@ def _sensors(drives: Sequence[Recording]) -> list[str]:
 
 def _series(name: str, drives: Sequence[Recording], moved: Sequence[int]) -> FieldSeries:
     """Return a sensor's readings of all drives, in order of time."""
-    found = [
-        (each, by)
+    parts = [
+        replace(each, stamp_ns=each.stamp_ns + by)
         for drive, by in zip(drives, moved, strict=True)
         for each in drive.series
         if each.sensor == name
     ]
-    stamps = np.concatenate([each.stamp_ns + by for each, by in found])
-    order = np.argsort(stamps, kind="stable")
-    field = np.concatenate([each.field for each, _ in found])
-    return replace(found[0][0], stamp_ns=stamps[order], field=field[order])
+    whole = joined_rows(parts)
+    return chosen_rows(whole, np.argsort(whole.stamp_ns, kind="stable"))
 
 
 def _scalar(name: str, drives: Sequence[Recording], moved: Sequence[int]) -> ScalarSeries:
     """Return a recorded number of all drives, in order of time."""
     found = [next(each for each in drive.scalars if each.name == name) for drive in drives]
-    stamps = np.concatenate([s.stamp_ns + by for s, by in zip(found, moved, strict=True)])
-    unique, first = np.unique(stamps, return_index=True)
-    value = np.concatenate([each.value for each in found])
-    return replace(found[0], stamp_ns=unique, value=value[first])
+    parts = zip(found, moved, strict=True)
+    whole = joined_rows([replace(each, stamp_ns=each.stamp_ns + by) for each, by in parts])
+    return chosen_rows(whole, np.unique(whole.stamp_ns, return_index=True)[1])
 
 
 def _source(drives: Sequence[Recording]) -> SourceFile:

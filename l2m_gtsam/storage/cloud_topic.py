@@ -197,14 +197,8 @@ def _pose_at(trajectory: Trajectory, stamp_ns: int, max_gap_s: float) -> RigidTr
         return RigidTransform(trajectory.R[after], trajectory.p[after])
     if after in (0, len(known)) or known[after] - known[after - 1] > max_gap_s * 1e9:
         return None
-    near = slice(after - 1, after + 1)
-    ends = Link(
-        trajectory.frame,
-        trajectory.child_frame,
-        known[near],
-        trajectory.R[near],
-        trajectory.p[near],
-    )
+    near = trajectory[np.array([after - 1, after])]
+    ends = Link(near.frame, near.child_frame, near.stamp_ns, near.R, near.p)
     between = ends.at(np.array([stamp_ns]))
     return RigidTransform(between.R[0], between.p[0])
 
