@@ -7,7 +7,7 @@ integer nanoseconds.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -84,6 +84,22 @@ def chosen_rows(table: Table, rows: IntArray | BoolArray) -> Table:
     return part
 
 
+class RowTable:
+    """A table of arrays whose rows are chosen as those of an array."""
+
+    def __getitem__(self, rows: IntArray | BoolArray) -> Self:
+        return chosen_rows(self, rows)
+
+
+class TimedTable(RowTable):
+    """One with a time for each row."""
+
+    stamp_ns: IntArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+
 Row3 = tuple[float, float, float]
 Vector = Annotated[FloatArray, InFile(Row3)]
 """Shape (3,)."""
@@ -112,7 +128,7 @@ class RigidTransform:
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(TimedTable):
     """Poses of one body in one reference frame, in order of time.
 
     Attributes
@@ -140,15 +156,9 @@ class Trajectory:
     child_frame: str
     covariance: FloatArray | None = None
 
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
-
-    def __getitem__(self, rows: IntArray | BoolArray) -> "Trajectory":
-        return chosen_rows(self, rows)
-
 
 @dataclass(frozen=True)
-class FieldSeries:
+class FieldSeries(TimedTable):
     """What one magnetometer reported, in its own frame and in order of time.
 
     Attributes
@@ -169,12 +179,9 @@ class FieldSeries:
     stamp_ns: IntArray
     field: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
-
 
 @dataclass(frozen=True)
-class ScalarSeries:
+class ScalarSeries(TimedTable):
     """A number that was recorded along a drive: a motor's current, a speed, a duty cycle.
 
     Attributes
@@ -193,9 +200,6 @@ class ScalarSeries:
     topic: str
     stamp_ns: IntArray
     value: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
 
 
 @dataclass(frozen=True)
@@ -255,7 +259,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class LidarMotion:
+class LidarMotion(RowTable):
     """How the lidar moves at N readings, and when their poses were taken.
 
     Attributes
@@ -277,12 +281,9 @@ class LidarMotion:
         """Return motion at constant velocities, shape (N, 6), with poses at the stamps."""
         return cls(twist_lidar, np.zeros_like(twist_lidar), np.zeros(len(twist_lidar)))
 
-    def __getitem__(self, rows: IntArray | BoolArray) -> "LidarMotion":
-        return chosen_rows(self, rows)
-
 
 @dataclass(frozen=True)
-class Readings:
+class Readings(TimedTable):
     """Readings of all sensors with the lidar's pose at each, as one batch.
 
     Attributes
@@ -324,12 +325,6 @@ class Readings:
     regressors: FloatArray | None = None
     drive: IntArray | None = None
     relative_noise: FloatArray | None = None
-
-    def __len__(self) -> int:
-        return len(self.sensor)
-
-    def __getitem__(self, rows: IntArray) -> "Readings":
-        return chosen_rows(self, rows)
 
     @property
     def of_drive(self) -> IntArray:

@@ -24,7 +24,6 @@ from l2m_gtsam.data import (
     SyncCounts,
     Synchronised,
     Trajectory,
-    chosen_rows,
     joined_rows,
 )
 from l2m_gtsam.errors import CalibrationError
@@ -247,7 +246,7 @@ def _series(name: str, drives: Sequence[Recording], moved: Sequence[int]) -> Fie
         if each.sensor == name
     ]
     whole = joined_rows(parts)
-    return chosen_rows(whole, np.argsort(whole.stamp_ns, kind="stable"))
+    return whole[np.argsort(whole.stamp_ns, kind="stable")]
 
 
 def _scalar(name: str, drives: Sequence[Recording], moved: Sequence[int]) -> ScalarSeries:
@@ -255,7 +254,7 @@ def _scalar(name: str, drives: Sequence[Recording], moved: Sequence[int]) -> Sca
     found = [next(each for each in drive.scalars if each.name == name) for drive in drives]
     parts = zip(found, moved, strict=True)
     whole = joined_rows([replace(each, stamp_ns=each.stamp_ns + by) for each, by in parts])
-    return chosen_rows(whole, np.unique(whole.stamp_ns, return_index=True)[1])
+    return whole[np.unique(whole.stamp_ns, return_index=True)[1]]
 
 
 def _source(drives: Sequence[Recording]) -> SourceFile:

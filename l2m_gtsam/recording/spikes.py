@@ -65,7 +65,7 @@ def without_spikes(recording: Recording, max_pose_gap_s: float) -> tuple[Recordi
         wrong = series_spikes(recording, each, max_pose_gap_s)
         shares.append(float(np.count_nonzero(wrong)) / max(len(each), 1))
         if wrong.any():
-            each = replace(each, stamp_ns=each.stamp_ns[~wrong], field=each.field[~wrong])
+            each = each[~wrong]
         series.append(each)
     return replace(recording, series=tuple(series)) if any(shares) else recording, shares
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, IntArray, Recording, chosen_rows
+from l2m_gtsam.data import BoolArray, IntArray, Recording
 
 
 def split_at(recording: Recording, stamp_ns: int) -> tuple[Recording, Recording]:
@@ -18,8 +18,8 @@ def split_at(recording: Recording, stamp_ns: int) -> tuple[Recording, Recording]
         return replace(
             recording,
             trajectory=poses[on(poses.stamp_ns)],
-            series=tuple(chosen_rows(each, on(each.stamp_ns)) for each in recording.series),
-            scalars=tuple(chosen_rows(each, on(each.stamp_ns)) for each in recording.scalars),
+            series=tuple(each[on(each.stamp_ns)] for each in recording.series),
+            scalars=tuple(each[on(each.stamp_ns)] for each in recording.scalars),
         )
 
     return part(later=False), part(later=True)

@@ -17,16 +17,7 @@ from typing import Annotated, Self
 
 import numpy as np
 
-from l2m_gtsam.data import (
-    BoolArray,
-    FloatArray,
-    InFile,
-    IntArray,
-    Matrix,
-    Row3,
-    Vector,
-    chosen_rows,
-)
+from l2m_gtsam.data import FloatArray, InFile, IntArray, Matrix, Row3, RowTable, Vector
 
 ONE_DRIVE = (slice(None),)  # all rows
 
@@ -53,7 +44,7 @@ class Model(StrEnum):
 
 
 @dataclass(frozen=True)
-class Samples:
+class Samples(RowTable):
     """Readings of one sensor in order of time, and what could explain them.
 
     Attributes
@@ -84,9 +75,6 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.z)
-
-    def __getitem__(self, rows: IntArray | BoolArray) -> "Samples":
-        return chosen_rows(self, rows)
 
     @property
     def drives(self) -> tuple[slice, ...]:

@@ -9,8 +9,8 @@ from l2m_gtsam.data import (
     FloatArray,
     IntArray,
     RigidTransform,
+    RowTable,
     Trajectory,
-    chosen_rows,
 )
 from l2m_gtsam.geometry import between, compose, moved
 from l2m_gtsam.lidar.registration import PoseEstimate
@@ -23,7 +23,7 @@ MAP = -1  # in place of a key pose: the frame of the map
 
 
 @dataclass(frozen=True)
-class Links:
+class Links(RowTable):
     """L scan registrations: poses of key poses in the map, or relative to an earlier key pose.
 
     Attributes
@@ -46,9 +46,6 @@ class Links:
 
     def __len__(self) -> int:
         return len(self.key_pose)
-
-    def __getitem__(self, rows: IntArray | BoolArray) -> "Links":
-        return chosen_rows(self, rows)
 
     @classmethod
     def none(cls) -> "Links":

@@ -7,7 +7,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import solve_one_key
-from l2m_gtsam.data import FloatArray, IntArray, chosen_rows
+from l2m_gtsam.data import FloatArray, IntArray, RowTable
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.honesty.drives import (
@@ -28,7 +28,7 @@ BLOCKS = {"t": slice(0, 3), "C, H": slice(3, 15), "all": slice(0, 15)}
 
 
 @dataclass(frozen=True)
-class Outcomes:
+class Outcomes(RowTable):
     """What came of N calibrations.
 
     Attributes
@@ -72,9 +72,6 @@ class Outcomes:
     def enough(self) -> bool:
         """Whether these are of more than one survey."""
         return len(np.unique(self.survey)) > 1
-
-    def __getitem__(self, rows: IntArray) -> "Outcomes":
-        return chosen_rows(self, rows)
 
 
 @dataclass(frozen=True)
