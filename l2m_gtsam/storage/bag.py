@@ -17,7 +17,7 @@ from l2m_gtsam.storage.bag_options import BagOptions, Stamps, TfChain
 from l2m_gtsam.storage.clocks import check_clocks, check_stamps, clock_notes
 from l2m_gtsam.storage.field_types import FieldSource, is_field
 from l2m_gtsam.storage.files import source_file
-from l2m_gtsam.storage.log import Log, Message
+from l2m_gtsam.storage.log import Message
 from l2m_gtsam.storage.messages import (
     ALL_POSE_TYPES,
     PATH_TYPE,
@@ -31,7 +31,7 @@ from l2m_gtsam.storage.messages import (
     stamped_poses,
 )
 from l2m_gtsam.storage.open_bag import Bag
-from l2m_gtsam.storage.open_log import open_log
+from l2m_gtsam.storage.open_log import Log, open_log
 from l2m_gtsam.storage.pose_files import read_poses
 from l2m_gtsam.storage.selection import (
     pose_notes,

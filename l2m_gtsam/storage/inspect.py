@@ -15,9 +15,8 @@ from l2m_gtsam.recording.saturation import saturated_axes, saturation_sentence
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps
 from l2m_gtsam.storage.clocks import UNSTAMPED, set_to_meet
 from l2m_gtsam.storage.field_types import FIELD_TYPES, VECTOR_TYPE, field_source, is_field
-from l2m_gtsam.storage.log import Log
 from l2m_gtsam.storage.messages import ALL_POSE_TYPES, PATH_TYPE, POSE_TYPES, TF_TYPES
-from l2m_gtsam.storage.open_log import open_log
+from l2m_gtsam.storage.open_log import Log, open_log
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
 from l2m_gtsam.storage.pose_files import read_poses
 from l2m_gtsam.storage.selection import (

@@ -1,9 +1,9 @@
-"""A log of any kind as its readers see it: topics, and the messages on them."""
+"""Messages of logs of any kind, and logs that are tables in memory."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
 
@@ -32,31 +32,6 @@ class Message:
     def stamp_ns(self, stamps: Stamps) -> int:
         """Return the time that counts in nanoseconds."""
         return self.record_ns if stamps is Stamps.RECORD else stamp_of(self.content, self.record_ns)
-
-
-class Log(Protocol):
-    """What readers need of a log."""
-
-    @property
-    def path(self) -> Path:
-        """The file or folder."""
-        ...
-
-    @property
-    def connections(self) -> Sequence[Connection]:
-        """Its topics."""
-        ...
-
-    @property
-    def duration_s(self) -> float:
-        """Time between the first and the last record in seconds."""
-        ...
-
-    def messages(
-        self, connections: Sequence[Connection], progress: Count | None = None
-    ) -> Iterator[Message]:
-        """Yield the messages of topics; a BagError if the log is damaged."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -90,7 +65,7 @@ class TableTopic:
 
 
 class TableLog:
-    """A log whose topics are tables in memory."""
+    """A log whose topics are tables in memory: what readers need of a ``Bag``."""
 
     def __init__(self, path: Path, channels: Sequence[TableTopic]) -> None:
         self.path = path

@@ -8,10 +8,11 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bag_options import ColumnOptions
 from l2m_gtsam.storage.bounded import require_regular
 from l2m_gtsam.storage.csv_log import read_csv_log
-from l2m_gtsam.storage.log import ACCEPTED, TABLES, Log
-from l2m_gtsam.storage.open_bag import open_bag
+from l2m_gtsam.storage.log import ACCEPTED, TABLES, TableLog
+from l2m_gtsam.storage.open_bag import Bag, open_bag
 from l2m_gtsam.storage.ulog import read_ulog
 
+Log = Bag | TableLog
 READERS: dict[str, Callable[[Path, ColumnOptions], Log]] = {
     ".csv": read_csv_log,
     ".ulg": lambda path, _: read_ulog(path),

@@ -13,8 +13,8 @@ from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_options import ColumnOptions, RegressorTopic, Stamps
 from l2m_gtsam.storage.clocks import check_stamps
 from l2m_gtsam.storage.field_types import Step, number_at, steps_of
-from l2m_gtsam.storage.log import Log, Message
-from l2m_gtsam.storage.open_log import open_log
+from l2m_gtsam.storage.log import Message
+from l2m_gtsam.storage.open_log import Log, open_log
 from l2m_gtsam.storage.selection import listed
 
 

@@ -19,8 +19,8 @@ from l2m_gtsam.storage.field_types import (
     is_field,
     named_source,
 )
-from l2m_gtsam.storage.log import Log
 from l2m_gtsam.storage.messages import ALL_POSE_TYPES, TF_TYPES
+from l2m_gtsam.storage.open_log import Log
 
 ROS_POSE_TYPES = tuple(each for each in ALL_POSE_TYPES if not each.startswith("csv/"))
 WITH_COVARIANCE = [each for each in ALL_POSE_TYPES if "Covariance" in each or "Odometry" in each]

@@ -10,7 +10,6 @@ from l2m_gtsam.errors import L2MError
 from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag import path_trajectory
 from l2m_gtsam.storage.field_types import FieldSource
-from l2m_gtsam.storage.log import Log
 from l2m_gtsam.storage.messages import (
     PATH_TYPE,
     TF_TYPES,
@@ -23,6 +22,7 @@ from l2m_gtsam.storage.messages import (
     stamped_poses,
 )
 from l2m_gtsam.storage.open_bag import Bag
+from l2m_gtsam.storage.open_log import Log
 from l2m_gtsam.storage.units import is_turning, strength
 
 Bodies = dict[tuple[str, str], PoseBuffer]
