@@ -112,9 +112,8 @@ def _structure_topic(
 ) -> StructureCloud:
     """Return what the scans of all bags saw, placed by their poses."""
     topics = [topic] * len(bags)
-    clouds = _clouds(topics, bags, recordings, config.mapping.structure, config, progress)
-    points = np.concatenate([cloud.points for cloud in clouds])
-    return StructureCloud(points, {"topic": topic, **_counts(clouds)})
+    cloud = _cloud(topics, bags, recordings, config.mapping.structure, config, progress)
+    return StructureCloud(cloud.points, {"topic": topic, **_counts(cloud)})
 
 
 def scanned_place(
@@ -131,8 +130,8 @@ def scanned_place(
     """
     options = config.mapping.lidar
     topics = [cloud_topic(bag, config.lidar.topic) for bag in bags]
-    clouds = _clouds(topics, bags, recordings, options, config, progress)
-    points = thinned_cloud(np.concatenate([cloud.points for cloud in clouds]), options.edge)
+    cloud = _cloud(topics, bags, recordings, options, config, progress)
+    points = thinned_cloud(cloud.points, options.edge)
     if len(points) > MAX_LIDAR_POINTS:
         raise MapError(
             f"the cloud has {len(points):,} points, a map takes {MAX_LIDAR_POINTS:,} at most; "
@@ -141,21 +140,21 @@ def scanned_place(
     points = smoothed(points)
     R, p = _along([each.trajectory for each in recordings])
     notes = [note for each in recordings for note in each.notes]
-    provenance = {"topics": topics, "points": len(points), "edge": options.edge, **_counts(clouds)}
+    provenance = {"topics": topics, "points": len(points), "edge": options.edge, **_counts(cloud)}
     provenance |= {"notes": notes} if notes else {}
     return ScannedPlace(LidarMap(points, R, p), provenance)
 
 
-def _clouds(
+def _cloud(
     topics: Sequence[str],
     bags: Sequence[Path],
     recordings: Sequence[Recording],
     options: CloudTopicOptions,
     config: Config,
     progress: Progress,
-) -> list[TopicCloud]:
-    """Return what the scans of each bag saw, placed by its poses."""
-    return [
+) -> TopicCloud:
+    """Return what the scans of all bags saw, each placed by the poses of its own."""
+    clouds = [
         read_cloud_topic(
             bag,
             topic,
@@ -166,20 +165,21 @@ def _clouds(
         )
         for topic, bag, recording in zip(topics, bags, recordings, strict=True)
     ]
+    return TopicCloud(
+        np.concatenate([each.points for each in clouds]),
+        sum(each.scans for each in clouds),
+        sum(each.without_pose for each in clouds),
+    )
 
 
-def _counts(clouds: Sequence[TopicCloud]) -> dict[str, int]:
-    return {
-        "scans": sum(cloud.scans for cloud in clouds),
-        "scans_without_pose": sum(cloud.without_pose for cloud in clouds),
-    }
+def _counts(cloud: TopicCloud) -> dict[str, int]:
+    return {"scans": cloud.scans, "scans_without_pose": cloud.without_pose}
 
 
 def _along(trajectories: Sequence[Trajectory]) -> tuple[FloatArray, FloatArray]:
     """Return rotations (K, 3, 3) and positions (K, 3) of drives, some distance apart."""
-    rows = [_spaced(each.p) for each in trajectories]
-    R = np.concatenate([each.R[row] for each, row in zip(trajectories, rows, strict=True)])
-    p = np.concatenate([each.p[row] for each, row in zip(trajectories, rows, strict=True)])
+    poses = [each[_spaced(each.p)] for each in trajectories]
+    R, p = np.concatenate([each.R for each in poses]), np.concatenate([each.p for each in poses])
     step = -(-len(p) // MAX_PLACES)
     return R[::step], p[::step]
 

@@ -14,7 +14,6 @@ from l2m_gtsam.progress import Count
 from l2m_gtsam.records.scans import Scan, ScanOptions, taken_at_once
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import VoxelMeans, located
-from l2m_gtsam.storage.log import Message
 from l2m_gtsam.storage.open_bag import open_bag
 from l2m_gtsam.storage.point_cloud2 import cloud_connections, points_of, times_of
 from l2m_gtsam.storage.point_table import MAX_POINTS
@@ -90,11 +89,15 @@ def read_cloud_topic(
     MapError
         The poses are too far from the origin of the map.
     """
-    merged = _MergedScans(f"{path}: topic {topic}", trajectory, options)
-    with open_bag(path) as bag:
-        for message in bag.messages(cloud_connections(bag, topic), progress):
-            merged.add(message, message.stamp_ns(stamps))
-    return merged.cloud()
+    where = f"{path}: topic {topic}"
+    merged = _MergedScans(where, trajectory, options)
+    try:
+        with open_bag(path) as bag:
+            for message in bag.messages(cloud_connections(bag, topic), progress):
+                merged.add(message.content, message.stamp_ns(stamps))
+        return merged.cloud()
+    except ValueError as error:
+        raise BagError(f"{where}: {error}") from error
 
 
 class _MergedScans:
@@ -108,22 +111,16 @@ class _MergedScans:
         self._cells = VoxelMeans(options.edge)
         self._scans = self._placed = 0
 
-    def add(self, message: Message, stamp_ns: int) -> None:
-        """Place and merge one scan."""
-        scan = message.content
+    def add(self, scan: Any, stamp_ns: int) -> None:
+        """Place and merge one scan; a ValueError if it is not usable."""
         self._check_frame(scan.header.frame_id)
         self._scans += 1
         pose = self._pose_at(stamp_ns)
-        if pose is None:
+        points = None if pose is None else self._points(scan, stamp_ns, pose)
+        if pose is None or points is None:
             return
-        try:
-            points = self._points(scan, stamp_ns, pose)
-            if points is None:
-                return
-            self._placed += 1
-            self._cells.add(located(points @ pose.R.T + pose.t, self._where))
-        except ValueError as error:
-            raise BagError(f"{self._where}: {error}") from error
+        self._placed += 1
+        self._cells.add(located(points @ pose.R.T + pose.t, self._where))
         if len(self._cells) > MAX_POINTS:
             raise BagError(
                 f"{self._where}: fills more than {MAX_POINTS} cells of {self._options.edge:g} m; "
@@ -131,13 +128,10 @@ class _MergedScans:
             )
 
     def cloud(self) -> TopicCloud:
-        """Return the cloud of the scans so far."""
+        """Return the cloud of the scans so far; a ValueError if it cannot be."""
         if not self._placed:
             raise BagError(self._nothing_placed())
-        try:
-            points = self._cells.points()
-        except ValueError as error:
-            raise BagError(f"{self._where}: {error}") from error
+        points = self._cells.points()
         if not len(points):
             raise BagError(
                 f"{self._where}: no scan has a finite point between {self._options.min_range:g} "
@@ -152,7 +146,18 @@ class _MergedScans:
         return None if twist is None else _in_range(taken_at_once(scan, twist), self._options)
 
     def _pose_at(self, stamp_ns: int) -> RigidTransform | None:
-        return _pose_at(self._trajectory, stamp_ns, self._options.max_pose_gap_s)
+        """Return the pose at a time, or nothing where there is none on either side near enough."""
+        trajectory, known = self._trajectory, self._trajectory.stamp_ns
+        most_ns = self._options.max_pose_gap_s * 1e9
+        after = int(np.searchsorted(known, stamp_ns))
+        if after < len(known) and known[after] == stamp_ns:
+            return RigidTransform(trajectory.R[after], trajectory.p[after])
+        if after in (0, len(known)) or known[after] - known[after - 1] > most_ns:
+            return None
+        near = trajectory[np.array([after - 1, after])]
+        ends = Link(near.frame, near.child_frame, near.stamp_ns, near.R, near.p)
+        between = ends.at(np.array([stamp_ns]))
+        return RigidTransform(between.R[0], between.p[0])
 
     def _twist(self, scan: Scan, pose: RigidTransform) -> FloatArray | None:
         """Return the lidar's mean twist over a scan; nothing where its end has no pose."""
@@ -187,20 +192,6 @@ class _MergedScans:
             f"{first:.3f} to {last:.3f} s and may be {self._options.max_pose_gap_s:g} s apart at "
             "most; if the clocks differ, try `bag.stamps: record`"
         )
-
-
-def _pose_at(trajectory: Trajectory, stamp_ns: int, max_gap_s: float) -> RigidTransform | None:
-    """Return the pose at a time, or nothing where there is none on either side near enough."""
-    known = trajectory.stamp_ns
-    after = int(np.searchsorted(known, stamp_ns))
-    if after < len(known) and known[after] == stamp_ns:
-        return RigidTransform(trajectory.R[after], trajectory.p[after])
-    if after in (0, len(known)) or known[after] - known[after - 1] > max_gap_s * 1e9:
-        return None
-    near = trajectory[np.array([after - 1, after])]
-    ends = Link(near.frame, near.child_frame, near.stamp_ns, near.R, near.p)
-    between = ends.at(np.array([stamp_ns]))
-    return RigidTransform(between.R[0], between.p[0])
 
 
 def _in_range(points: FloatArray, options: CloudTopicOptions) -> FloatArray:
