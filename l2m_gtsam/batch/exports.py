@@ -315,7 +315,7 @@ def apply_calibration(wanted: Application, progress: Progress) -> Applied:
         with bag_copy(bag, wanted.out) as copy:
             calibrator.copy(copy, counter(f"copying {name}", progress))
     added = {new.sensor: new.topic for new in topics.values()}
-    return Applied(added, (*judged, *usable.notes, *_unmatched(result, found)))
+    return Applied(added, (*judged, *left_out_notes(usable.left_out), *_unmatched(result, found)))
 
 
 def _config(wanted: Application, result: CalibrationResult) -> Config:

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -138,13 +138,8 @@ def write_slam(path: Path, record: LocalisationRecord) -> str:
 
 def record_id(path: Path) -> str:
     """Return the report id of a ``slam.json`` or ``validation.json`` that was read."""
-    return _checked(path, read_content(path, MAX_BYTES, CalibrationError))
-
-
-def _checked(path: Path, raw: bytes) -> str:
-    """Return the report id of a file; a CalibrationError if it carries another."""
-    content: Any = json.loads(raw)
-    return checked_id(path, content, CalibrationError)
+    raw = read_content(path, MAX_BYTES, CalibrationError)
+    return checked_id(path, json.loads(raw), CalibrationError)
 
 
 def read_slam(path: Path) -> LocalisationRecord:
@@ -245,5 +240,5 @@ def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> 
         fault = first_fault(error)
         raise CalibrationError(f"{path}: not a {kind} file of this program: {fault}") from error
     check_set(path, CalibrationError)
-    _checked(path, raw)
+    checked_id(path, json.loads(raw), CalibrationError)
     return found

@@ -173,12 +173,7 @@ def likely_units(written: FloatArray, units: Units, own: Unit | None) -> Units |
     typical = found.median
     if are_counts(written) and typical > 0:
         return EARTH_UT / typical
-    return suspected_unit(typical)
-
-
-def suspected_unit(as_written: float) -> Unit | None:
-    """Return the unit in which a strength as written is most like the Earth's, if any fits."""
-    return next(iter(_suspects(as_written)), None)
+    return next(iter(_suspects(typical)), None)
 
 
 def _suspects(as_written: float) -> list[Unit]:

@@ -108,11 +108,6 @@ class UsableSensors:
     sensors: tuple[SensorCalibration, ...]
     left_out: Mapping[str, str]
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """A sentence for each sensor that is left out."""
-        return left_out_notes(self.left_out)
-
 
 def left_out_notes(left_out: Mapping[str, str]) -> tuple[str, ...]:
     """Return a sentence for each sensor that is not in a file."""
