@@ -25,13 +25,7 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.qa.fleet import sensor_rows
 from l2m_gtsam.records.fleet import DATE, Computation, DriveOutcome, RowKey
 from l2m_gtsam.records.provenance import in_utc
-from l2m_gtsam.storage.drive_lists import (
-    ManifestEntry,
-    find_bags,
-    is_bag,
-    is_folder,
-    read_manifest,
-)
+from l2m_gtsam.storage.drive_lists import ManifestEntry, find_bags, is_bag, is_folder, read_manifest
 from l2m_gtsam.storage.files import folder_names, printable, source_file, unwritten
 from l2m_gtsam.storage.log import DRIVES
 from l2m_gtsam.storage.parts import sweep

@@ -19,11 +19,7 @@ from l2m_gtsam.qa.report.validation_page import validation_page
 from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.provenance import NamedSource
-from l2m_gtsam.records.validation import (
-    CalibrationComparison,
-    DriveValidation,
-    Validation,
-)
+from l2m_gtsam.records.validation import CalibrationComparison, DriveValidation, Validation
 from l2m_gtsam.storage.bag_options import BagOptions, PoseFileOptions
 from l2m_gtsam.storage.files import source_file, write_text
 from l2m_gtsam.storage.listed_sensors import read_sensors

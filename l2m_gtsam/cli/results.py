@@ -64,8 +64,7 @@ def report(
 def validate(
     calibration: CalibrationOption,
     bag: Annotated[
-        Path | None,
-        typer.Argument(metavar="[BAG]", help=f"Another drive: {LOGS}."),
+        Path | None, typer.Argument(metavar="[BAG]", help=f"Another drive: {LOGS}.")
     ] = None,
     map_path: Annotated[
         Path | None, typer.Option("--map", help="Map file of the place of the drive.")

@@ -28,10 +28,7 @@ if TYPE_CHECKING:
 
 
 def slam(
-    bag: Annotated[
-        Path,
-        typer.Argument(metavar="BAG", help=f"Drive with odometry: {LOGS}."),
-    ],
+    bag: Annotated[Path, typer.Argument(metavar="BAG", help=f"Drive with odometry: {LOGS}.")],
     calibration: SensorsOption,
     out: OutOption,
     map_path: Annotated[

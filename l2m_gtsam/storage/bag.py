@@ -33,12 +33,7 @@ from l2m_gtsam.storage.messages import (
 from l2m_gtsam.storage.open_bag import Bag
 from l2m_gtsam.storage.open_log import Log, open_log
 from l2m_gtsam.storage.pose_files import read_poses
-from l2m_gtsam.storage.selection import (
-    pose_notes,
-    select_fields,
-    select_poses,
-    sensor_names,
-)
+from l2m_gtsam.storage.selection import pose_notes, select_fields, select_poses, sensor_names
 from l2m_gtsam.storage.tf import Link, chain_frames, compose
 from l2m_gtsam.storage.units import field_fault, microtesla_per
 

@@ -11,11 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, SourceFile
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.records.calibration import (
-    CalibrationResult,
-    SensorCalibration,
-    Uncertainty,
-)
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
 from l2m_gtsam.records.error_budget import EXPLAINED
 from l2m_gtsam.records.record import fields_of
 from l2m_gtsam.records.verdict import NOT_JUDGED, Judgement

@@ -145,10 +145,7 @@ def check_stamps(path: Path, what: str, stamps: IntArray) -> None:
 
 
 def check_clocks(
-    path: Path,
-    poses: Trajectory,
-    series: tuple[FieldSeries, ...],
-    pose_file: Path | None = None,
+    path: Path, poses: Trajectory, series: tuple[FieldSeries, ...], pose_file: Path | None = None
 ) -> None:
     """Raise a BagError if poses and readings have different clocks.
 

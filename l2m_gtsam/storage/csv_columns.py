@@ -292,9 +292,7 @@ def _field_unit(name: Name) -> Unit | None:
 
 
 def _position(
-    names: Sequence[str],
-    vectors: Mapping[str, Mapping[str, int]],
-    options: ColumnOptions,
+    names: Sequence[str], vectors: Mapping[str, Mapping[str, int]], options: ColumnOptions
 ) -> tuple[int, int, int] | None:
     if options.position is not None:
         x, y, z = options.position

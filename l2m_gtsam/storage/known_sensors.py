@@ -336,9 +336,7 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
         warnings.warn(f"{path}: its verdict is FAIL; its sensors are used", Notice, stacklevel=2)
     return {
         name: replace(
-            _known(name, entry),
-            covariance=entry.errors.known(),
-            common=entry.errors.in_common(),
+            _known(name, entry), covariance=entry.errors.known(), common=entry.errors.in_common()
         )
         for name, entry in found.sensors.items()
     }

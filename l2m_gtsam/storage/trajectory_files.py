@@ -81,10 +81,7 @@ def write_trajectory_bag(path: Path, motion: LocalisedMotion) -> None:
         transform_channel(dialect, (map_odom(motion.localised, odometry), odometry)),
     ]
     stamps = np.concatenate([channel.stamp_ns for channel in channels])
-    with (
-        atomic_path(path) as temporary,
-        part_folder(path) as folder,
-    ):
+    with atomic_path(path) as temporary, part_folder(path) as folder:
         bag = folder / path.stem  # rosbag2 makes a folder, and repeats its name inside
         with Ros2Writer(bag, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
             write_channels(writer, dialect, channels, stamps)
