@@ -226,7 +226,7 @@ def survey_readings(
     readings = with_offsets(readings, recording.trajectory, offset)
     points, field = sensor_positions(readings, known), map_fields(readings, known)
     poses = survey_poses(recording.trajectory, readings, points, field, pose_noise)
-    doubts = saturation_doubts(readings.sensors, synchronised.counts)
+    doubts = saturation_doubts(readings.sensors, [each.limits for each in synchronised.counts])
     errors = suite_errors(readings, known)
     return SurveyReadings(points, field, readings.stamp_ns, errors, poses, doubts)
 

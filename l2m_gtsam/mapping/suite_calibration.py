@@ -186,7 +186,7 @@ def _result(
         uncertainty=Uncertainty.FULL,
         doubts=(
             *_doubts(drive.readings.sensors, solution, options),
-            *saturation_doubts(drive.readings.sensors, drive.counts),
+            *saturation_doubts(drive.readings.sensors, [each.limits for each in drive.counts]),
         ),
         disagreements=(),
         bag=None if recording.drives else recording.source,

@@ -13,7 +13,7 @@ from l2m_gtsam.data import (
     SaturatedAxis,
     Trajectory,
 )
-from l2m_gtsam.recording.saturation import is_saturated, saturated_axes, saturation_sentence
+from l2m_gtsam.recording.saturation import is_saturated, saturated_axes, saturation_doubts
 from l2m_gtsam.recording.sync import STUCK_UT, interpolated
 
 # So many readings that are identical while the vehicle moves so far, or turns so much.
@@ -47,11 +47,7 @@ def mask_dropouts(recording: Recording) -> MaskedRecording:
     limits = [saturated_axes(_finite(each)) for each in alive]
     series = tuple(map(_within_range, alive, limits))
     notes = [_note(each, trajectory) for each in alive]
-    notes += [
-        f"{each.sensor}: {saturation_sentence(own)}"
-        for each, own in zip(series, limits, strict=True)
-        if own
-    ]
+    notes += saturation_doubts([each.sensor for each in series], limits)
     return MaskedRecording(replace(recording, series=series), tuple(note for note in notes if note))
 
 

@@ -27,15 +27,12 @@ class Resampled:
 
     Attributes
     ----------
-    names
-        One for each of K numbers.
     values
-        In the units of their series, shape (N, K); 0 where one is not known.
+        K numbers in the units of their series, shape (N, K); 0 where one is not known.
     known
         Whether all of them are known at a reading, shape (N,).
     """
 
-    names: tuple[str, ...]
     values: FloatArray
     known: BoolArray
 
@@ -60,7 +57,7 @@ def resampled(
         near = _is_near(each.stamp_ns, stamp_ns, options.max_gap_s)
         values[near, k] = _interpolated(each, stamp_ns[near])
         known &= near
-    return Resampled(tuple(each.name for each in series), values, known)
+    return Resampled(values, known)
 
 
 def _interpolated(series: ScalarSeries, stamp_ns: IntArray) -> FloatArray:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy.special import bdtrc
 
-from l2m_gtsam.data import BoolArray, FloatArray, SaturatedAxis, SyncCounts
+from l2m_gtsam.data import BoolArray, FloatArray, SaturatedAxis
 
 CHANCE = 1e-10  # of so many ties at an extreme of a sound axis
 FEWEST = 3  # ties
@@ -134,16 +134,18 @@ def _share(limit: SaturatedAxis) -> str:
     return f"{limit.share:.0%}" if limit.share >= LEAST_SHOWN else f"{limit.share:.1%}"
 
 
-def saturation_doubts(names: Sequence[str], counts: Sequence[SyncCounts]) -> tuple[str, ...]:
+def saturation_doubts(
+    names: Sequence[str], limits: Sequence[tuple[SaturatedAxis, ...]]
+) -> tuple[str, ...]:
     """Return a sentence for each sensor whose range is exceeded, without a full stop.
 
     Parameters
     ----------
-    names, counts
+    names, limits
         Of each sensor.
     """
     return tuple(
-        f"{name}: {saturation_sentence(each.limits)}"
-        for name, each in zip(names, counts, strict=True)
-        if each.limits
+        f"{name}: {saturation_sentence(each)}"
+        for name, each in zip(names, limits, strict=True)
+        if each
     )
