@@ -19,7 +19,6 @@ from l2m_gtsam.batch.reports import (
 )
 from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import BagError, ConfigError, L2MError, NoRoomError, OutputError
 from l2m_gtsam.progress import silent
 from l2m_gtsam.qa.fleet import sensor_rows
@@ -267,13 +266,14 @@ def _outcome(task: FleetTask, shared: OpenMap | str, begun: float) -> DriveOutco
 def _calibrated(task: FleetTask, opened: OpenMap, begun: float) -> DriveOutcome:
     recording = read_drive_on(opened.saved, task.drive.bag, task.config, silent)
     opened.saved.check_frame(recording)
+    stamps = recording.trajectory.stamp_ns
     with calibration_results(task.out) as stage:
         found = calibrate_drive(recording, opened, task.config, stage, silent)
         verdict = report_calibration(stage, found, task.config.qa)
         outcome = DriveOutcome(
             key=task.key(recording.source.sha256),
-            start=in_utc(int(recording.trajectory.stamp_ns[0])),
-            duration=_duration(recording),
+            start=in_utc(int(stamps[0])),
+            duration=round(float(stamps[-1] - stamps[0]) / NANOSECONDS, 3),
             sensors=sensor_rows(found.result, verdict),
             error="",
             lasting=True,
@@ -332,11 +332,6 @@ def digest_of(path: Path) -> str:
         return source_file(path).sha256
     except L2MError:
         return ""
-
-
-def _duration(recording: Recording) -> float:
-    stamps = recording.trajectory.stamp_ns
-    return round(float(stamps[-1] - stamps[0]) / NANOSECONDS, 3)
 
 
 def _made(begun: float) -> Computation:

@@ -107,10 +107,9 @@ def _poses(report: BagReport) -> Iterator[str]:
     used = {each.topic for each in _used(report, "poses")}
     named = [each for each in report.topics if each.msgtype in ALL_POSE_TYPES and each.count]
     named.sort(key=lambda each: each.topic not in used)
-    for first in named[:1]:
-        yield f"  poses: {json.dumps(first.topic)}  # {_of_poses(first)}"
-    for other in named[1:]:
-        yield f"  # poses: {json.dumps(other.topic)}  # {_of_poses(other)}"
+    for number, each in enumerate(named):
+        other = "# " if number else ""
+        yield f"  {other}poses: {json.dumps(each.topic)}  # {_of_poses(each)}"
     moving = [t for t in report.topics if t.msgtype in TF_TYPES and "tf_static" not in t.topic]
     if not named and moving:
         yield from _chain([t for t in report.topics if t.msgtype in TF_TYPES])

@@ -136,11 +136,10 @@ class Calibrator:
         kept = {c.id: into.add(c) for c in self.bag.connections if c.topic not in self.left_out}
         added = self._connections(into, sources)
         stated, encode = into.add_text(free_topic(self.bag, VERDICT_TOPIC))
-        first = True
-        for block in _blocks(self.bag.raw_messages(self.bag.connections, progress)):
-            if first:
+        blocks = _blocks(self.bag.raw_messages(self.bag.connections, progress))
+        for number, block in enumerate(blocks):
+            if number == 0:
                 into.write(stated, block[0].record_ns, encode(self.verdict))
-                first = False
             extra = self._corrections(block)
             for row, message in enumerate(block):
                 if message.connection.id in kept:

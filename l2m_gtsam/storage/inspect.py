@@ -253,7 +253,7 @@ def _report(
     header, record = found.stamps.header(), found.stamps.record()
     gaps = np.diff(np.unique(header)).astype(np.float64) * 1e-9
     count = sum(c.msgcount for c in connections)
-    written = found.readings.field()
+    written, field = found.readings.field(), _in_microtesla(found, options)
     return TopicReport(
         topic=topic,
         msgtype=msgtype,
@@ -264,19 +264,19 @@ def _report(
         span_s=_span(header),
         clock_offset_s=float(np.median(record - header)) * 1e-9 if len(header) else float("nan"),
         nan_share=float(np.mean(~np.isfinite(written).all(axis=1))) if len(written) else np.nan,
-        strength=_strength(found, options),
+        strength=None if field is None else strength(field),
         use=_use(use, connections[0], found, options),
         likely_units=likely_units(written, options.units, found.readings.unit),
         links=tuple(sorted(found.bodies)) if msgtype in TF_TYPES else (),
     )
 
 
-def _strength(found: TopicContent, options: BagOptions) -> Strength | None:
-    """Return the strength of readings in microtesla, if there are any in a unit that is known."""
+def _in_microtesla(found: TopicContent, options: BagOptions) -> FloatArray | None:
+    """Return the readings of a topic, shape (N, 3), if there are any in a unit that is known."""
     written, own = found.readings.field(), found.readings.unit
     if not len(written) or (own is None and options.units is Unit.AUTO):
         return None
-    return strength(written * microtesla_per(options.units, own))
+    return written * microtesla_per(options.units, own)
 
 
 def _rate(gaps: FloatArray, count: int, duration_s: float) -> float:
@@ -341,9 +341,6 @@ def _field_use(
 
 def _beyond_range(found: TopicContent, options: BagOptions) -> str:
     """Return which limits of its range the readings of a topic exceed; empty if none."""
-    written, own = found.readings.field(), found.readings.unit
-    if own is None and options.units is Unit.AUTO:
-        return ""
-    field = written[np.isfinite(written).all(axis=1)] * microtesla_per(options.units, own)
-    limits = saturated_axes(field)
+    field = _in_microtesla(found, options)
+    limits = () if field is None else saturated_axes(field[np.isfinite(field).all(axis=1)])
     return f", but {saturation_sentence(limits)}" if limits else ""

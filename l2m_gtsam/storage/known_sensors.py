@@ -196,6 +196,11 @@ class _Known(_Finite):
     def _invertible(cls, C: Matrix) -> Matrix:
         return checked_gains(C)
 
+    def known(self, name: str) -> KnownSensor:
+        """Return it as a sensor with a name."""
+        seconds = 0.0 if self.time_offset is None else self.time_offset.seconds
+        return KnownSensor(name, self.t_lidar_mag, Distortion(self.C, self.H), seconds)
+
 
 class _Stated(_Known):
     """A sensor with what a file says of its errors."""
@@ -239,10 +244,6 @@ class ListedSensor(_Known):
     def has_noise(self) -> bool:
         """Whether the list says how large the noise of a reading is."""
         return "noise" in self.model_fields_set
-
-    def known(self, name: str) -> KnownSensor:
-        """Return it as a sensor with a name."""
-        return _known(name, self)
 
     def offset(self) -> TimeOffset | None:
         """Return the offset of its clock, which counts as exact; None where there is none."""
@@ -336,7 +337,7 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
         warnings.warn(f"{path}: its verdict is FAIL; its sensors are used", Notice, stacklevel=2)
     return {
         name: replace(
-            _known(name, entry), covariance=entry.errors.known(), common=entry.errors.in_common()
+            entry.known(name), covariance=entry.errors.known(), common=entry.errors.in_common()
         )
         for name, entry in found.sensors.items()
     }
@@ -364,8 +365,3 @@ def listed_sensors_in(path: Path, content: Any) -> dict[str, ListedSensor]:
         It is not of this form.
     """
     return dict(checked(path, content, _LIST).sensors)
-
-
-def _known(name: str, entry: _Known) -> KnownSensor:
-    seconds = 0.0 if entry.time_offset is None else entry.time_offset.seconds
-    return KnownSensor(name, entry.t_lidar_mag, Distortion(entry.C, entry.H), seconds)

@@ -2,8 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -24,10 +22,11 @@ TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 
 @dataclass(frozen=True)
 class Dialect:
-    """How one generation of ROS spells messages."""
+    """How one generation of ROS spells messages, and whether it counts them in their headers."""
 
     store: Typestore
     serialize: Callable[[object, str], bytes | memoryview]
+    counts: bool
 
     def make(self, name: str, /, **fields: Any) -> Any:
         """Return a message of this type."""
@@ -37,7 +36,7 @@ class Dialect:
         """Return a header; only ROS1 counts messages in it."""
         seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
         stamp = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        counter = {"seq": index} if self._counts_messages else {}
+        counter = {"seq": index} if self.counts else {}
         return self.make("std_msgs/msg/Header", **counter, stamp=stamp, frame_id=frame)
 
     def vector(self, values: FloatArray) -> Any:
@@ -56,11 +55,6 @@ class Dialect:
         """Return a rotation from x, y, z, w."""
         return self.make("geometry_msgs/msg/Quaternion", **named("xyzw", values))
 
-    @cached_property
-    def _counts_messages(self) -> bool:
-        """Whether headers have a counter; to look takes as long as to write a message."""
-        return "seq" in signature(self.store.types["std_msgs/msg/Header"]).parameters
-
 
 @dataclass(frozen=True)
 class Channel:
@@ -75,13 +69,13 @@ class Channel:
 def ros1() -> Dialect:
     """Return how ROS 1 spells messages."""
     store = get_typestore(Stores.ROS1_NOETIC)
-    return Dialect(store, store.serialize_ros1)
+    return Dialect(store, store.serialize_ros1, counts=True)
 
 
 def ros2() -> Dialect:
     """Return how ROS 2 does, as of Humble and later."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    return Dialect(store, store.serialize_cdr)
+    return Dialect(store, store.serialize_cdr, counts=False)
 
 
 def odometry_channel(

@@ -39,14 +39,9 @@ class Link:
     def at(self, stamp_ns: IntArray) -> "Link":
         """Return the link at these times, within its own; slerp and straight line between."""
         if self.is_static:
-            count = len(stamp_ns)
-            return Link(
-                self.parent,
-                self.child,
-                stamp_ns,
-                np.broadcast_to(self.R[0], (count, 3, 3)),
-                np.broadcast_to(self.p[0], (count, 3)),
-            )
+            R = np.broadcast_to(self.R[0], (len(stamp_ns), 3, 3))
+            p = np.broadcast_to(self.p[0], (len(stamp_ns), 3))
+            return Link(self.parent, self.child, stamp_ns, R, p)
         seconds = (self.stamp_ns - self.stamp_ns[0]) * 1e-9
         wanted = (stamp_ns - self.stamp_ns[0]) * 1e-9
         p = np.column_stack([np.interp(wanted, seconds, axis) for axis in self.p.T])

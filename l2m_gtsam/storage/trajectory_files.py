@@ -9,7 +9,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Trajectory
-from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.files import atomic_path, write_text
 from l2m_gtsam.storage.parts import part_folder
 from l2m_gtsam.storage.ros_messages import odometry_channel, ros2, transform_channel, write_channels
 
@@ -25,8 +25,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     OutputError
         The file cannot be written.
     """
-    with atomic_path(path) as temporary:
-        temporary.write_text(tum_text(trajectory), encoding="utf-8")
+    write_text(path, tum_text(trajectory))
 
 
 def tum_text(trajectory: Trajectory) -> str:
