@@ -4,14 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from l2m_gtsam.batch.files import (
-    OpenMap,
-    SavedMap,
-    check_bags,
-    check_outputs,
-    ensure_folder,
-    read_drive,
-)
+from l2m_gtsam.batch.files import OpenMap, SavedMap, check_bags, check_outputs, read_drive
 from l2m_gtsam.batch.scan_poses import read_drives_on
 from l2m_gtsam.batch.software import versions
 from l2m_gtsam.calibration.calibrate import calibrated
@@ -28,7 +21,7 @@ from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.plan import DrivePlan
 from l2m_gtsam.storage.bag import has_fields, read_trajectory
 from l2m_gtsam.storage.calibration_file import write_calibration
-from l2m_gtsam.storage.files import source_file
+from l2m_gtsam.storage.files import ensure_folder, source_file
 from l2m_gtsam.storage.inspect import BagReport, inspect_bag
 from l2m_gtsam.storage.record_files import write_metrics
 from l2m_gtsam.storage.rerun_file import require_rerun, write_scene

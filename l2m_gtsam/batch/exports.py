@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from l2m_gtsam.batch.files import check_outputs, ensure_folder, saved_options
+from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.data import CorrectedField, FloatArray, IntArray, ScalarSeries
@@ -38,7 +38,7 @@ from l2m_gtsam.storage.exports.export import (
 )
 from l2m_gtsam.storage.exports.formats import FORMATS
 from l2m_gtsam.storage.exports.urdf import edited_urdf
-from l2m_gtsam.storage.files import atomic_path, source_file
+from l2m_gtsam.storage.files import atomic_path, ensure_folder, source_file
 from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.open_bag import Bag, open_bag
 from l2m_gtsam.storage.regressors import read_scalars

@@ -19,7 +19,7 @@ from l2m_gtsam.records.map_diary import UNDATED, MapDrive
 from l2m_gtsam.records.provenance import MapOrigin, NamedSource
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.bag import read_recording
-from l2m_gtsam.storage.files import source_file, unwritten
+from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.map_file import load_map
 from l2m_gtsam.storage.regressors import read_scalars
 from l2m_gtsam.storage.tile_folder import tiles_beside
@@ -37,14 +37,6 @@ def check_outputs(*files: Path, suffix: str | None = None) -> None:
             raise OutputError(f"{file}: exists and is not a regular file; choose another --out")
         if file.parent.exists() and not file.parent.is_dir():
             raise OutputError(f"{file.parent}: is a file; a folder is needed there")
-
-
-def ensure_folder(folder: Path) -> None:
-    """Make a folder for results, and those above it, unless it is there; an OutputError if not."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritten(folder, error, "cannot be made as a folder for results") from error
 
 
 @runtime_checkable

@@ -6,14 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from l2m_gtsam.batch.files import (
-    SavedMap,
-    check_outputs,
-    ensure_folder,
-    entries_of,
-    surveyed_in,
-    used_file,
-)
+from l2m_gtsam.batch.files import SavedMap, check_outputs, entries_of, surveyed_in
 from l2m_gtsam.batch.survey import MappingDrives, read_survey, scanned_place
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
@@ -24,6 +17,7 @@ from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, Remembering
 from l2m_gtsam.progress import Progress, reported
 from l2m_gtsam.records.map_diary import MapDiary
+from l2m_gtsam.storage.files import ensure_folder
 from l2m_gtsam.storage.map_file import save_map
 from l2m_gtsam.upkeep.kept_map import drive_dates, kept_up
 from l2m_gtsam.upkeep.surveys import map_surveys
@@ -89,7 +83,7 @@ def build_map_file(
         )
     provenance = {
         "bags": [vars(recording.source) for recording in survey.recordings],
-        "suite": None if suite is None else used_file(suite, survey.suite_level),
+        "suite": survey.suite_file,
         "structure": None if survey.structure is None else survey.structure.provenance,
         "lidar": None if scanned is None else scanned.provenance,
         "frame": survey.recordings[0].trajectory.frame,
@@ -131,12 +125,10 @@ def update_map_file(
         Whatever is wrong with the input, in one line.
     """
     check_outputs(out, suffix=".npz")
-    drives = _added(map_path, bags, config, suite, progress)
+    saved, field_map, drives = _with_drives(map_path, bags, config, suite, progress)
     with reported("updating the map", progress):
-        updated = update_map(
-            drives.field_map, drives.recordings, drives.survey.suite, config.mapping
-        )
-    return drives.write(out, updated, config)
+        updated = update_map(field_map, drives.recordings, drives.suite, config.mapping)
+    return _write_updated(out, updated, saved, drives, config)
 
 
 def keep_map_file_up(
@@ -176,69 +168,50 @@ def keep_map_file_up(
             "--changes needs a calibrated vehicle: else steel of the place and of the vehicle are "
             "confused; give its calibration with --suite"
         )
-    drives = _added(map_path, bags, config, suite, progress)
+    saved, field_map, drives = _with_drives(map_path, bags, config, suite, progress)
     with reported("looking for what changed", progress):
         kept = kept_up(
-            drives.field_map,
+            field_map,
             drives.recordings,
-            drives.survey.suite or {},
+            drives.suite or {},
             config.mapping,
             config.calibration.changes,
-            surveyed_in(drives.saved.state.provenance),
+            surveyed_in(saved.state.provenance),
         )
-    return drives.write(out, kept, config)
+    return _write_updated(out, kept, saved, drives, config)
 
 
-@dataclass(frozen=True)
-class _AddedDrives:
-    """A map, and drives that it is to be given.
-
-    Attributes
-    ----------
-    saved, field_map
-        The file, and the map in it.
-    suite
-        File of their sensors' calibrations.
-    """
-
-    saved: SavedMap
-    field_map: FieldMap
-    survey: MappingDrives
-    suite: Path | None
-
-    @property
-    def recordings(self) -> list[Recording]:
-        return self.survey.recordings
-
-    def write(self, out: Path, updated: FieldMap, config: Config) -> DescribedMap:
-        """Write the map with these drives."""
-        added = [vars(recording.source) for recording in self.recordings]
-        update = {
-            "bags": added,
-            "suite": None if self.suite is None else used_file(self.suite, self.survey.suite_level),
-            "config": config.model_dump(mode="json", include={"bag": True, "mapping": {"sync"}}),
-            "version": version("l2m-gtsam"),
-        }
-        before = self.saved.state.provenance
-        provenance = {
-            **before,
-            **updated.to_state().provenance,
-            "bags": [*self.saved.bags, *added],
-            "updates": [*entries_of(before, "updates"), update],
-            "frame": self.recordings[0].trajectory.frame,
-        }
-        return write_map(out, updated, provenance, self.saved.state.lidar)
-
-
-def _added(
+def _with_drives(
     map_path: Path, bags: Sequence[Path], config: Config, suite: Path | None, progress: Progress
-) -> _AddedDrives:
+) -> tuple[SavedMap, FieldMap, MappingDrives]:
     """Return a map with the drives that it is to be given, none of which it has."""
     saved = SavedMap.read(map_path)
     known = saved.bags
-    survey = read_survey(bags, config, suite, None, progress)
-    _check_new(map_path, known, survey.recordings)
-    return _AddedDrives(saved, saved.open(progress, survey.recordings), survey, suite)
+    drives = read_survey(bags, config, suite, None, progress)
+    _check_new(map_path, known, drives.recordings)
+    return saved, saved.open(progress, drives.recordings), drives
+
+
+def _write_updated(
+    out: Path, updated: FieldMap, saved: SavedMap, drives: MappingDrives, config: Config
+) -> DescribedMap:
+    """Write a saved map after it was given drives."""
+    added = [vars(recording.source) for recording in drives.recordings]
+    update = {
+        "bags": added,
+        "suite": drives.suite_file,
+        "config": config.model_dump(mode="json", include={"bag": True, "mapping": {"sync"}}),
+        "version": version("l2m-gtsam"),
+    }
+    before = saved.state.provenance
+    provenance = {
+        **before,
+        **updated.to_state().provenance,
+        "bags": [*saved.bags, *added],
+        "updates": [*entries_of(before, "updates"), update],
+        "frame": drives.recordings[0].trajectory.frame,
+    }
+    return write_map(out, updated, provenance, saved.state.lidar)
 
 
 def compare_map_kinds(

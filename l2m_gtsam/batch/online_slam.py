@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.batch.files import SavedMap, ensure_folder, map_notes
+from l2m_gtsam.batch.files import SavedMap, map_notes
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow
 from l2m_gtsam.batch.slam import (
@@ -47,7 +47,7 @@ from l2m_gtsam.slam.options import CalibrationUse, Usage
 from l2m_gtsam.slam.result import refined
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
-from l2m_gtsam.storage.files import source_file
+from l2m_gtsam.storage.files import ensure_folder, source_file
 from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.online_log import (
     LogLine,

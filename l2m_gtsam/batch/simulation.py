@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from l2m_gtsam.batch.files import ensure_folder
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.simulate.bag_writer import BagKind, Beside, WriterOptions, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.cloud import write_cloud
+from l2m_gtsam.storage.files import ensure_folder
 from l2m_gtsam.storage.known_sensors import write_known_sensors
 from l2m_gtsam.storage.trajectory_files import write_tum
 

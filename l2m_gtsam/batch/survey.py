@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.batch.files import check_bags, check_outputs, ensure_folder, read_drive
+from l2m_gtsam.batch.files import check_bags, check_outputs, read_drive, used_file
 from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.batch.software import versions
 from l2m_gtsam.config import Config
@@ -21,7 +21,7 @@ from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, TopicCloud, read_cloud_topic
-from l2m_gtsam.storage.files import source_file
+from l2m_gtsam.storage.files import ensure_folder, source_file
 from l2m_gtsam.storage.known_sensors import level_of, read_known_sensors
 from l2m_gtsam.storage.point_cloud2 import cloud_topic
 
@@ -60,14 +60,14 @@ class MappingDrives:
         Sensors of the mapping suite by name; absent where all are ideal.
     structure
         What a LiDAR saw, if that was given.
-    suite_level
-        The verdict on the file of the suite, if it has one.
+    suite_file
+        What a map's file says of the file of the suite, if there is one.
     """
 
     recordings: list[Recording]
     suite: dict[str, KnownSensor] | None
     structure: StructureCloud | None
-    suite_level: Level | None = None
+    suite_file: dict[str, Any] | None
 
     @property
     def cloud(self) -> FloatArray | None:
@@ -84,14 +84,14 @@ def read_survey(
 ) -> MappingDrives:
     """Return everything that a map is made of; files before bags, which take longer."""
     known = None if suite is None else read_known_sensors(suite)
-    level = None if suite is None else level_of(suite)
+    used = None if suite is None else used_file(suite, level_of(suite))
     options = config.mapping.structure
     is_file = structure is not None and _names_file(structure)
     cloud = _structure_file(Path(structure or ""), options) if is_file else None
     recordings = [read_drive_or_follow(bag, config, progress) for bag in bags]
     if structure is not None and not is_file:
         cloud = _structure_topic(structure, bags, recordings, config, progress)
-    return MappingDrives(recordings, known, cloud, level)
+    return MappingDrives(recordings, known, cloud, used)
 
 
 def _names_file(structure: str) -> bool:

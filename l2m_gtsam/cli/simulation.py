@@ -61,13 +61,13 @@ def demo(
     """Simulate, map and calibrate a warehouse, and compare with the truth."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import OVERVIEW_FILE, calibrate_bags
-        from l2m_gtsam.batch.files import ensure_folder
         from l2m_gtsam.batch.maps import build_map_file
         from l2m_gtsam.batch.reports import REPORT_FILE, calibration_results, report_calibration
         from l2m_gtsam.batch.simulation import STRUCTURE_FILE, SUITE_FILE, bag_name, simulate_bags
         from l2m_gtsam.cli.tables.calibration import consistency_note, truth_table
         from l2m_gtsam.config import Config
         from l2m_gtsam.simulate.bag_writer import BagKind
+        from l2m_gtsam.storage.files import ensure_folder
 
         wanted, chosen, map_path = _scenario(options, seed), Config(), out / "map.npz"
         ensure_folder(out)

@@ -103,6 +103,14 @@ def unwritten(path: Path, error: OSError, what: str = "cannot be written") -> Ou
     return OutputError(line)
 
 
+def ensure_folder(folder: Path) -> None:
+    """Make a folder for results, and those above it, unless it is there; an OutputError if not."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritten(folder, error, "cannot be made as a folder for results") from error
+
+
 def flush(path: Path) -> None:
     """Have what a file or a folder holds on the disk, before a name points to it."""
     handle = os.open(path, os.O_RDONLY)

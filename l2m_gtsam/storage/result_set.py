@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from l2m_gtsam.errors import L2MError, OutputError
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.storage.bounded import read_content
-from l2m_gtsam.storage.files import flush, source_file, unwritten
+from l2m_gtsam.storage.files import ensure_folder, flush, source_file, unwritten
 from l2m_gtsam.storage.parts import only_one, part_folder
 
 SET_FILE = "results.json"
@@ -86,10 +86,7 @@ def made(folder: Path) -> Iterator[None]:
         It cannot be made.
     """
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritten(folder, error, "cannot be made as a folder for results") from error
+    ensure_folder(folder)
     try:
         yield
     except BaseException:
