@@ -111,50 +111,50 @@ MOST_JUMPS = 3  # of H of one sensor on one drive: one that jumps so often wande
 
 
 @dataclass(frozen=True)
-class OffsetJump(Record):
+class OffsetChange(Record):
+    """A change of H on a drive.
+
+    Attributes
+    ----------
+    sensor
+        Of which.
+    stamp_ns, seconds
+        Of a jump when it is: by its stamps, and after the first reading of the drive. Of a drift
+        when the drive begins, and how long it is.
+    change, sigma
+        H after less before, or at the end less at the beginning, and its standard deviation, uT.
+    """
+
+    sensor: str
+    stamp_ns: int
+    seconds: float
+    change: Row
+    sigma: Row
+
+
+@dataclass(frozen=True)
+class OffsetJump(OffsetChange):
     """A jump of H at one moment of a drive.
 
     Attributes
     ----------
-    sensor
-        Of which.
-    stamp_ns, seconds
-        When: by its stamps, and after the first reading of the drive.
-    change, sigma
-        H after less before and its standard deviation, uT.
     bag
         The drive, where several were calibrated together; then times are its own.
     """
 
-    sensor: str
-    stamp_ns: int
-    seconds: float
-    change: Row
-    sigma: Row
     bag: str = ""
 
 
 @dataclass(frozen=True)
-class OffsetDrift(Record):
+class OffsetDrift(OffsetChange):
     """H that drifts over a drive, steadily or ever more slowly.
 
     Attributes
     ----------
-    sensor
-        Of which.
-    stamp_ns, seconds
-        When the drive begins, and how long it is.
-    change, sigma
-        H at the end less H at the beginning and its standard deviation, uT.
     time_constant_s
         Of the exponential by which it slows down; absent where it is steady.
     """
 
-    sensor: str
-    stamp_ns: int
-    seconds: float
-    change: Row
-    sigma: Row
     time_constant_s: float | None = None
 
     def share(self, stamp_ns: IntArray) -> FloatArray:
