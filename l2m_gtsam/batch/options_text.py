@@ -114,14 +114,12 @@ PAGES: dict[str, tuple[str, type[Options]]] = {
 LIMITS = {"gt": "> {}", "ge": "≥ {}", "lt": "< {}", "le": "≤ {}"}
 
 
-def options_page(head: str, model: type[Options]) -> str:
-    """Return a page in Markdown: a table for every model, under the full name of its key."""
-    return GENERATED + head + "".join(_sections(model, "", model()))
-
-
 def pages() -> dict[str, str]:
-    """Return the pages by their paths in the documentation."""
-    return {path: options_page(head, model) for path, (head, model) in PAGES.items()}
+    """Return the pages in Markdown, a table for every model, by their paths in the docs."""
+    return {
+        path: GENERATED + head + "".join(_sections(model, "", model()))
+        for path, (head, model) in PAGES.items()
+    }
 
 
 def _sections(model: type[BaseModel], prefix: str, values: BaseModel | None) -> Iterator[str]:

@@ -245,15 +245,17 @@ def _compared(steps: _Steps, good: BoolArray, options: JumpOptions) -> _StepComp
         [(turn.inv() * Rotation.from_rotvec(steps.turn)).as_rotvec(), steps.shift - shift]
     )
     off[:, 3:] = turn.inv().apply(off[:, 3:])
-    reach = steps.seconds * away
-    found = _StepComparison(turn.as_matrix(), shift, off, reach, _acceleration(steps, good), good)
+    reach, changes = steps.seconds * away, _changes(steps, good)
+    # Mean squares per axis.
+    acceleration = np.asarray(np.mean(changes**2, axis=0) / AXES)
+    found = _StepComparison(turn.as_matrix(), shift, off, reach, acceleration, good)
     sizes = found.sizes()
     limits = np.maximum(
         np.array([np.deg2rad(options.rotation_deg), options.position_m]),
         options.scatter * np.median(sizes, axis=0),
     )
     most = np.array([np.deg2rad(options.acceleration_deg_s2), options.acceleration_m_s2])
-    own = options.accelerations * np.quantile(_changes(steps, good), USUAL, axis=0)
+    own = options.accelerations * np.quantile(changes, USUAL, axis=0)
     gap = steps.seconds > GAP * np.median(steps.seconds)  # in which the vehicle may have stopped
     limits = np.maximum(
         limits, reach[:, None] * np.where(gap[:, None], most, np.minimum(most, own))
@@ -273,11 +275,6 @@ def _about(steps: _Steps, good: BoolArray) -> tuple[FloatArray, FloatArray]:
     away = np.where(there, np.abs(steps.middle[near] - steps.middle[:, None]), np.nan)
     velocity = np.where(there[:, :, None], steps.velocity()[near], np.nan)
     return np.nanmedian(velocity, axis=1), np.nanmedian(away, axis=1)
-
-
-def _acceleration(steps: _Steps, good: BoolArray) -> FloatArray:
-    """Return mean squares per axis of how velocities change between good steps, shape (2,)."""
-    return np.asarray(np.mean(_changes(steps, good) ** 2, axis=0) / AXES)
 
 
 def _changes(steps: _Steps, good: BoolArray) -> FloatArray:

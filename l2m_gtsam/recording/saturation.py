@@ -48,7 +48,8 @@ def saturated_axes(field: FloatArray) -> tuple[SaturatedAxis, ...]:
         for limit in (float(values[0]), float(values[-1])):
             away = np.abs(distinct[:, k] - limit)
             ties, around = int(np.sum(away == 0)), int(np.sum(away <= near))
-            if ties >= FEWEST and _tail(ties, around, np.sqrt(step / near)) <= CHANCE:
+            # How often so many of those around or more would be at the limit by chance.
+            if ties >= FEWEST and bdtrc(ties - 1, around, np.sqrt(step / near)) <= CHANCE:
                 at = int(np.sum(field[:, k] == limit))
                 found.append(SaturatedAxis(axis, limit, at, len(field)))
     return tuple(each for each in found if not _is_calm(field, each, found))
@@ -65,11 +66,6 @@ def _step(values: FloatArray) -> float:
     multiples = gaps / gaps.min()
     on_grid = np.abs(multiples - np.round(multiples)) < OFF_GRID
     return float(gaps.min()) if on_grid.mean() >= ON_GRID else 0.0
-
-
-def _tail(ties: int, readings: int, share: float) -> float:
-    """Return how often so many of some readings or more are among those with this probability."""
-    return float(bdtrc(ties - 1, readings, share))
 
 
 def _is_calm(field: FloatArray, limit: SaturatedAxis, all_: Sequence[SaturatedAxis]) -> bool:

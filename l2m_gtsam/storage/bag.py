@@ -1,6 +1,6 @@
 """Read a drive out of a bag: the lidar's poses and every magnetometer's readings."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -330,7 +330,8 @@ def path_trajectory(bag: Bag, paths: Sequence[Connection], progress: Count | Non
     """
     latest: dict[int, Any] = {}
     frames: set[str] = set()
-    for content in _grown(bag, paths, progress) or _contents(bag, paths, progress):
+    every = (message.content for message in bag.messages(paths, progress))
+    for content in _grown(bag, paths, progress) or every:
         frames.add(frame_of(content))
         stamps = [header_ns(each) for each in content.poses]
         if len(set(stamps)) < min(len(stamps), 2):
@@ -347,10 +348,6 @@ def path_trajectory(bag: Bag, paths: Sequence[Connection], progress: Count | Non
     for stamp_ns, stamped in sorted(latest.items()):
         buffer.add(stamp_ns, stamped.pose.position, stamped.pose.orientation)
     return buffer.trajectory()
-
-
-def _contents(bag: Bag, paths: Sequence[Connection], progress: Count | None) -> Iterator[Any]:
-    return (message.content for message in bag.messages(paths, progress))
 
 
 def _grown(bag: Bag, paths: Sequence[Connection], progress: Count | None) -> list[Any]:
