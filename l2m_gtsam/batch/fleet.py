@@ -119,7 +119,8 @@ def _computed(
         count(len(outcomes), len(tasks))
     once = counted_once({task.drive.folder: outcomes[task.drive.folder] for task in tasks})
     rows = [row for task in tasks for row in _rows(task.drive, once[task.drive.folder])]
-    return _publish(out, rows, options, Fleet((), len(tasks), len(missing), ()))
+    marked = with_outliers(sorted(rows, key=_order), options)
+    return Fleet(marked, len(tasks), len(missing), _publish(out, marked, options))
 
 
 def fleet_tasks(listed: Sequence[FleetDrive], out: Path) -> list[FleetTask]:
@@ -230,14 +231,13 @@ def _rows(drive: FleetDrive, outcome: DriveOutcome) -> list[FleetRow]:
     ]
 
 
-def _publish(out: Path, rows: Sequence[FleetRow], options: FleetOptions, fleet: Fleet) -> Fleet:
-    """Write page and tables; return the fleet with its rows."""
-    marked = with_outliers(sorted(rows, key=_order), options)
+def _publish(out: Path, rows: Sequence[FleetRow], options: FleetOptions) -> tuple[str, ...]:
+    """Write page and tables; return what could not be written, a sentence each."""
     with published(out, PAGE_FILE, CSV_FILE, PARQUET_FILE) as stage:
-        write_csv(stage / CSV_FILE, marked)
-        notes = write_parquet(stage / PARQUET_FILE, marked)
-        write_text(stage / PAGE_FILE, fleet_page(marked, options))
-    return replace(fleet, rows=marked, notes=notes)
+        write_csv(stage / CSV_FILE, rows)
+        notes = write_parquet(stage / PARQUET_FILE, rows)
+        write_text(stage / PAGE_FILE, fleet_page(rows, options))
+    return notes
 
 
 def _order(row: FleetRow) -> tuple[str, str, str, str]:
