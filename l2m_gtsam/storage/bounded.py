@@ -10,7 +10,7 @@ import os
 import stat
 import struct
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BufferedReader
@@ -26,6 +26,10 @@ from l2m_gtsam.text import shown
 MEGABYTE = 1_000_000
 # The end of an archive: its signature, eight bytes, then the size of its directory.
 END, END_BYTES, LONGEST_COMMENT = b"PK\x05\x06", 22, 1 << 16
+# A bomb is refused for the size that it declares, or for its checksum.
+COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# Booleans, integers, unsigned, floating and complex numbers; anything else could hide objects.
+NUMERIC = "biufc"
 MOST_DIRECTORY = 1 << 20  # of thousands of members
 PIECE = 1 << 24
 MOST_NAMES = 6  # in a message
@@ -180,17 +184,13 @@ class ArrayMember:
 
 
 @contextmanager
-def open_archive(
-    path: Path, error: type[L2MError], missing: str, kinds: Collection[int]
-) -> Iterator[zipfile.ZipFile]:
+def open_archive(path: Path, error: type[L2MError], missing: str) -> Iterator[zipfile.ZipFile]:
     """Open an archive.
 
     Parameters
     ----------
     path, error, missing
         As in ``bounded.opened``.
-    kinds
-        Compressions that are accepted, as ``zipfile`` numbers them.
 
     Raises
     ------
@@ -205,12 +205,12 @@ def open_archive(
             archive = zipfile.ZipFile(file)
         with archive:
             for info in archive.infolist():
-                if info.compress_type not in kinds:
+                if info.compress_type not in COMPRESSIONS:
                     raise ArchiveError(f"its member {info.filename!r} is compressed unusually")
             yield archive
 
 
-def read_stored_array(archive: zipfile.ZipFile, name: str, kinds: str) -> npt.NDArray[Any]:
+def read_stored_array(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
     """Return an array that is as large as the archive says, read into its memory at once.
 
     Parameters
@@ -219,8 +219,6 @@ def read_stored_array(archive: zipfile.ZipFile, name: str, kinds: str) -> npt.ND
         Open.
     name
         Of the member.
-    kinds
-        Of numbers that are accepted, as numpy names them.
 
     Raises
     ------
@@ -228,7 +226,7 @@ def read_stored_array(archive: zipfile.ZipFile, name: str, kinds: str) -> npt.ND
         It is missing or damaged.
     """
     with opened_array(archive, name) as member:
-        foreign = member.fortran or member.dtype.kind not in kinds
+        foreign = member.fortran or member.dtype.kind not in NUMERIC
         if foreign or bytes_of(member.shape, member.dtype) != member.size:
             raise ArchiveError(f"array {name!r} is not what it declares to be")
         found, filled = np.empty(member.size, dtype=np.uint8), 0

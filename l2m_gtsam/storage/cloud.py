@@ -113,7 +113,6 @@ class VoxelMeans:
 
 
 NPZ_MEMBER = "points.npy"
-COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # Held at once: 120 MB, and a few times as much while they are merged.
 MAX_CELLS = 5_000_000
 MAX_KEPT_POINTS = 20_000_000  # of a cloud that is not thinned: 480 MB, twice for a moment
@@ -140,9 +139,7 @@ def thinned_cloud(points: FloatArray, edge: float) -> FloatArray:
     ValueError
         Points are more than a million cells apart.
     """
-    means = VoxelMeans(edge)
-    means.add(points)
-    return means.points()
+    return _collected([points], edge)
 
 
 def read_cloud(path: Path, edge: float = 0.0) -> FloatArray:
@@ -238,7 +235,7 @@ def _few(pieces: Iterable[FloatArray]) -> Iterator[FloatArray]:
 
 
 def _npz_pieces(path: Path) -> Iterator[FloatArray]:
-    with open_archive(path, MapError, MISSING, COMPRESSIONS) as archive:
+    with open_archive(path, MapError, MISSING) as archive:
         if NPZ_MEMBER not in archive.namelist():
             raise ValueError("it has no array `points`")
         with opened_array(archive, NPZ_MEMBER) as member:

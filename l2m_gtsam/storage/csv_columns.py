@@ -66,7 +66,7 @@ class Name:
 class FieldColumns:
     """Columns x, y and z of a magnetometer, and the unit that they state."""
 
-    columns: tuple[int, int, int]
+    columns: tuple[int, ...]
     unit: Unit | None
 
 
@@ -91,8 +91,8 @@ class Roles:
     stamp: tuple[int, ...]
     time_unit: TimeUnit
     fields: Mapping[str, FieldColumns]
-    position: tuple[int, int, int] | None
-    orientation: tuple[int, int, int, int] | None
+    position: tuple[int, ...] | None
+    orientation: tuple[int, ...] | None
     left_out: tuple[str, ...] = ()
 
 
@@ -158,6 +158,10 @@ def _place(names: Sequence[str], wanted: str) -> int:
     if wanted not in plain:
         raise ValueError(f"no column {wanted!r}; there are: {', '.join(plain[:30])}")
     return plain.index(wanted)
+
+
+def _places(names: Sequence[str], wanted: Sequence[str]) -> tuple[int, ...]:
+    return tuple(_place(names, each) for each in wanted)
 
 
 def _stamp(
@@ -255,18 +259,17 @@ def _fields(
     stem: str,
 ) -> dict[str, FieldColumns]:
     if options.fields:
-        given = {}
-        for label, (x, y, z) in options.fields.items():
-            columns = (_place(names, x), _place(names, y), _place(names, z))
-            given[label] = FieldColumns(columns, _field_unit(parts[columns[0]]))
-        return given
-    found = {}
-    for base, axes in vectors.items():
-        if "w" not in axes:
-            columns = (axes["x"], axes["y"], axes["z"])
-            label = "_".join(filter(None, WORDS.split(base))) or stem
-            found[label] = FieldColumns(columns, _field_unit(parts[columns[0]]))
-    return found
+        found = {label: _places(names, wanted) for label, wanted in options.fields.items()}
+    else:
+        found = {
+            "_".join(filter(None, WORDS.split(base))) or stem: tuple(axes[each] for each in "xyz")
+            for base, axes in vectors.items()
+            if "w" not in axes
+        }
+    return {
+        label: FieldColumns(columns, _field_unit(parts[columns[0]]))
+        for label, columns in found.items()
+    }
 
 
 def _is_magnetic(base: str, bare: bool) -> bool:
@@ -293,24 +296,22 @@ def _field_unit(name: Name) -> Unit | None:
 
 def _position(
     names: Sequence[str], vectors: Mapping[str, Mapping[str, int]], options: ColumnOptions
-) -> tuple[int, int, int] | None:
+) -> tuple[int, ...] | None:
     if options.position is not None:
-        x, y, z = options.position
-        return _place(names, x), _place(names, y), _place(names, z)
+        return _places(names, options.position)
     for base, axes in vectors.items():
         likely = _last(base) in POSITIONS or base.startswith("p_")
         if likely and "w" not in axes:
-            return axes["x"], axes["y"], axes["z"]
+            return tuple(axes[each] for each in "xyz")
     return None
 
 
 def _orientation(
     names: Sequence[str], vectors: Mapping[str, Mapping[str, int]], options: ColumnOptions
-) -> tuple[int, int, int, int] | None:
+) -> tuple[int, ...] | None:
     if options.orientation is not None:
-        x, y, z, w = options.orientation
-        return _place(names, x), _place(names, y), _place(names, z), _place(names, w)
+        return _places(names, options.orientation)
     for axes in vectors.values():
         if "w" in axes:
-            return axes["x"], axes["y"], axes["z"], axes["w"]
+            return tuple(axes[each] for each in "xyzw")
     return None

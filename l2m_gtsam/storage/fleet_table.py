@@ -68,10 +68,8 @@ def write_parquet(path: Path, rows: Sequence[FleetRow]) -> tuple[str, ...]:
     types = {name: pa.string() if name in TEXTS else pa.float64() for name in columns}
     types["date"] = pa.timestamp("ms", tz="UTC")
     values: dict[str, list[Any]] = {**columns, "date": [_stamp(row.date) for row in rows]}
-    arrays = [
-        pa.array([_readable(value) for value in values[name]], types[name]) for name in columns
-    ]
-    table = pa.Table.from_arrays(arrays, schema=pa.schema(types.items()))
+    readable = {name: [_readable(value) for value in values[name]] for name in columns}
+    table = pa.Table.from_pydict(readable, schema=pa.schema(types.items()))
     with atomic_path(path) as temporary:
         pq.write_table(table, temporary, version="2.6")
     return ()

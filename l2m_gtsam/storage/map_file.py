@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from l2m_gtsam.data import LidarMap, MapState
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.storage.bounded import open_archive, read_stored_array
+from l2m_gtsam.storage.bounded import NUMERIC, open_archive, read_stored_array
 from l2m_gtsam.storage.files import atomic_path
 
 FORMAT = "l2m-map"
@@ -31,12 +31,8 @@ READ = (FORMER, VERSION)
 HEADER, CHECKSUM, ARRAYS = "header.npy", "checksum.npy", "arrays/"
 LIDAR = "lidar/"
 LIDAR_SHAPES = {"points": (3,), "R": (3, 3), "p": (3,)}
-# Booleans, integers, unsigned, floating and complex numbers; anything else could hide objects.
-NUMERIC = "biufc"
 MAX_BYTES = 512 << 20
 MISSING = "no such map file; make one with `l2m map build`"
-# Ours are not compressed; a bomb is refused for its size below, or for its checksum.
-COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -86,19 +82,17 @@ def load_map(path: Path) -> MapState:
         The file is missing, is something else, is damaged, is from a newer version or is too
         large.
     """
-    with _translated(path), open_archive(path, MapError, MISSING, COMPRESSIONS) as archive:
+    with _translated(path), open_archive(path, MapError, MISSING) as archive:
         _refuse_large(path, archive)
         _refuse_foreign(path, archive)
-        header = read_stored_array(archive, HEADER, NUMERIC)
+        header = read_stored_array(archive, HEADER)
         content = _decode_header(path, header)
         arrays = {
-            name.removeprefix(ARRAYS).removesuffix(".npy"): read_stored_array(
-                archive, name, NUMERIC
-            )
+            name.removeprefix(ARRAYS).removesuffix(".npy"): read_stored_array(archive, name)
             for name in archive.namelist()
             if name.startswith(ARRAYS)
         }
-        checksum = read_stored_array(archive, CHECKSUM, NUMERIC)
+        checksum = read_stored_array(archive, CHECKSUM)
     if checksum.tobytes() != _checksum(header, arrays).tobytes():
         raise MapError(
             f"{path}: the checksum does not match, the file is damaged; build the map again"
