@@ -88,15 +88,12 @@ def verdict_notes(path: Path, result: CalibrationResult, despite_verdict: bool) 
 
 def _worst_reason(verdict: Verdict) -> str:
     """Return the first of the reasons that make a verdict what it is, and how many more."""
-    whole = [each.text for each in verdict.reasons if each.level is verdict.level]
-    whole += [
-        f"{sensor.sensor}: {each.text}"
-        for sensor in verdict.sensors
-        for each in sensor.reasons
-        if each.level is verdict.level
-    ]
-    more = f" (and {len(whole) - 1} more)" if len(whole) > 1 else ""
-    return f"{whole[0].rstrip('.')}{more}" if whole else "it gives no reason"
+    worst = [each for each in verdict.warnings if each.level is verdict.level]
+    if not worst:
+        return "it gives no reason"
+    more = f" (and {len(worst) - 1} more)" if len(worst) > 1 else ""
+    of_sensor = f"{worst[0].sensor}: " if worst[0].sensor else ""
+    return f"{of_sensor}{worst[0].text.rstrip('.')}{more}"
 
 
 def export_calibration(
