@@ -104,26 +104,23 @@ class BagCopy:
         return connection, encode
 
     def _add(self, connection: Connection, topic: str) -> Connection:
-        added: Connection
+        own: dict[str, Any]
         if isinstance(connection.ext, ConnectionExtRosbag1):
-            added = self.writer.add_connection(
-                topic,
-                connection.msgtype,
-                msgdef=connection.msgdef.data,
-                md5sum=connection.digest,
-                callerid=connection.ext.callerid,
-                latching=connection.ext.latching,
-            )
-            return added
-        definition, digest = _described(connection)
-        added = self.writer.add_connection(
-            topic,
-            connection.msgtype,
-            msgdef=definition,
-            rihs01=digest,
-            serialization_format=connection.ext.serialization_format,
-            offered_qos_profiles=connection.ext.offered_qos_profiles,
-        )
+            own = {
+                "msgdef": connection.msgdef.data,
+                "md5sum": connection.digest,
+                "callerid": connection.ext.callerid,
+                "latching": connection.ext.latching,
+            }
+        else:
+            definition, digest = _described(connection)
+            own = {
+                "msgdef": definition,
+                "rihs01": digest,
+                "serialization_format": connection.ext.serialization_format,
+                "offered_qos_profiles": connection.ext.offered_qos_profiles,
+            }
+        added: Connection = self.writer.add_connection(topic, connection.msgtype, **own)
         return added
 
 
