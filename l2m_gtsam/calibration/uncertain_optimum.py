@@ -79,7 +79,7 @@ class UncertainOptimum:
 
     def solutions(self) -> tuple[SensorSolution, ...]:
         """Return covariance and figures of every sensor."""
-        joint, problem, tests = self.joint, self.problem, self.problem.tests
+        joint, problem, tests = self.joint, self.problem, self.problem.drive.tests
         sensors = tuple(self._view.sensors)
         system = joint_covariance(
             problem.graph.linearize(self.values), self.values, joint.of_system
@@ -249,7 +249,7 @@ class UncertainOptimum:
 
     def _taken(self, sensor: int) -> float:
         """Return the degrees of freedom that the fit took of a sensor's readings."""
-        return self.problem.tests[sensor].free + self.joint.taken(sensor)
+        return self.problem.drive.tests[sensor].free + self.joint.taken(sensor)
 
     def _correction(self, sensor: int) -> Correction | None:
         """Return what recorded numbers still add to a sensor's readings; none if none act on it."""
