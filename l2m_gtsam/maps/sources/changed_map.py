@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
-from l2m_gtsam.maps.field_map import optional_members
+from l2m_gtsam.maps.field_map import WrappedMap
 from l2m_gtsam.maps.sources.found_sources import FoundSources
 from l2m_gtsam.maps.sources.source import SourceShape
 
@@ -91,7 +91,7 @@ class ChangedErrors:
         return np.concatenate([of_map, self.of_sources.features(points)], axis=2)
 
 
-class ChangedMap:
+class ChangedMap(WrappedMap):
     """A map and sources beside it; in all else the map itself.
 
     Parameters
@@ -103,14 +103,8 @@ class ChangedMap:
     """
 
     def __init__(self, field_map: SurveyedField, found: FoundSources) -> None:
-        self._map: Any = field_map
+        super().__init__(field_map)
         self._found = found
-        vars(self).update(optional_members(field_map, self))
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "_map":  # before there is one, as when another process unpacks it
-            raise AttributeError(name)
-        return getattr(self._map, name)
 
     def __reduce__(self) -> tuple[type["ChangedMap"], tuple[SurveyedField, FoundSources]]:
         return ChangedMap, (self._map, self._found)
