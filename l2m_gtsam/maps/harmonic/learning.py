@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from pydantic import Field
-from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import COARSE, Basis, basis_of
@@ -29,9 +29,9 @@ from l2m_gtsam.maps.trained import learning_words
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.solve.minimum import minimised, on_bound
 
 ROUNDS = 2  # learning is repeated while it asks for finer modes than it looked at
-BOUND_TOLERANCE = 1e-6
 FURTHEST = np.log(300.0)  # from where a search starts
 NOISIER = 10.0  # times the usual noise, from where it starts again
 BETTER = 1.0  # nats: less is the same maximum
@@ -209,16 +209,8 @@ def maximise(
         )
         return -sum(part.value for part in parts), -gradient
 
-    end = minimize(
-        cost,
-        x0,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=Bounds(low, high),
-        options={"maxiter": 60, "ftol": 1e-6},
-    )
-    on_bound = np.minimum(end.x - low, high - end.x) < BOUND_TOLERANCE
-    at_bound = tuple(name for name, on in zip(names, on_bound, strict=True) if on)
+    end = minimised(cost, x0, low, high, maxiter=60, ftol=1e-6)
+    at_bound = tuple(compress(names, on_bound(end.x, low, high)))
     return LearningEnd(
         hyperparameters=moved(start, names, end.x),
         log_likelihood=-float(end.fun),
