@@ -9,6 +9,8 @@ import numpy as np
 from numba import njit
 from scipy.linalg import cholesky, eigh_tridiagonal
 from scipy.linalg.lapack import dgeqrf, dpstrf, dtrtri
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from l2m_gtsam.data import FloatArray, IntArray
 
@@ -176,6 +178,20 @@ def submatrix(matrix: FloatArray, at: IntArray) -> FloatArray:
         for j in range(len(at)):
             found[i, j] = matrix[row, at[j]]
     return found
+
+
+def parts_of(pairs: IntArray, count: int) -> IntArray:
+    """Return which connected part of a graph each of its nodes is in, from 0, shape (n,).
+
+    Parameters
+    ----------
+    pairs
+        Nodes that are connected, shape (E, 2).
+    count
+        Number n of nodes.
+    """
+    edges = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+    return np.asarray(connected_components(edges, directed=False)[1])
 
 
 def eigenpairs(product: Product, first: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:

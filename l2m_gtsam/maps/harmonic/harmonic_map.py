@@ -7,7 +7,7 @@ from typing import ClassVar, Self
 import numpy as np
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, MapState
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, MovedTiles, error_modes, tile_modes
@@ -41,23 +41,6 @@ PIECE = 65_536  # about the most points of a share
 BLOCK = 0.5  # metres: what a map knows of a square of this size fits the processor's cache
 SERIAL = 6_000  # fewer points than this are not worth threads
 FEW = 32  # the same of their variance, a hundred times as slow
-
-
-@dataclass(frozen=True)
-class TileShare:
-    """What one tile predicts at the points that it has a share in.
-
-    Attributes
-    ----------
-    values
-        Field in uT and gradient in uT/m of all these points, shapes (N, 3) and (N, 3, 3).
-    own, variance
-        Which of the points lie in the tile's core, shape (N,), and the variance there, (K, 3).
-    """
-
-    values: tuple[FloatArray, FloatArray]
-    own: BoolArray
-    variance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -286,15 +269,15 @@ class HarmonicMap:
         blend, variance = Blend.of(len(points)), np.empty_like(points)
         parts, owner = self.learnt.tiling.by_tile(points), self.learnt.tiling.grid.block_of(points)
 
-        def answer(part: TilePoints) -> TileShare:
+        def answer(part: TilePoints) -> tuple[FloatArray, FloatArray]:
             # All points of a tile at once: it may not stay in memory.
             tile, at = self.tiles[part.tile], points[part.rows]
             own = owner[part.rows] == part.tile
-            return TileShare(tile.field_and_gradient(at), own, tile.variance(at[own]))
+            variance[part.rows[own]] = tile.variance(at[own])
+            return tile.field_and_gradient(at)
 
-        for part, found in zip(parts, in_threads(answer, parts), strict=True):
-            blend.add(part.rows, part.share, found.values)
-            variance[part.rows[found.own]] = found.variance
+        for part, values in zip(parts, in_threads(answer, parts), strict=True):
+            blend.add(part.rows, part.share, values)
         return blend.field, blend.gradient, variance
 
     def compile(self) -> "CompiledMap":
