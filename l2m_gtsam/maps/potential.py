@@ -136,13 +136,10 @@ class PotentialBasis:
 
     def _sines(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return normalised sines and cosines along each axis, shape (N, 3, n)."""
-        S = np.empty((len(points), AXES, len(self.waves)))
+        S, norm = np.empty((len(points), AXES, len(self.waves))), np.sqrt(2 / self.size)
         C = np.empty_like(S)
         for axis, (numbers, own) in enumerate(self._distinct):
-            angle, norm = (
-                np.outer(points[:, axis] - self.low[axis], numbers),
-                np.sqrt(2 / self.size),
-            )
+            angle = np.outer(points[:, axis] - self.low[axis], numbers)
             S[:, axis] = (norm[axis] * np.sin(angle))[:, own]
             C[:, axis] = (norm[axis] * np.cos(angle))[:, own]
         return S, C

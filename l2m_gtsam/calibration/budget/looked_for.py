@@ -4,8 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from l2m_gtsam.calibration.budget.clock import CLOCK_MODES, ClockDrift
-from l2m_gtsam.calibration.budget.moving_parts import MotionUnits, MovingParts
 from l2m_gtsam.calibration.budget.processes import (
     WANDER_MODES,
     FieldProcess,
@@ -16,7 +14,13 @@ from l2m_gtsam.calibration.budget.processes import (
     Wander,
     Warp,
 )
-from l2m_gtsam.calibration.budget.smoothing import Smoothing
+from l2m_gtsam.calibration.budget.sensor_processes import (
+    CLOCK_MODES,
+    ClockDrift,
+    MotionUnits,
+    MovingParts,
+    Smoothing,
+)
 
 # Of each of six errors of poses, and of fields: what lasts a second is half a wave of 1.75 s and
 # more. With fewer modes than that, errors of poses look like fields.

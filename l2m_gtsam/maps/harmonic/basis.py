@@ -153,10 +153,9 @@ def basis_of(
 
 def basis_with(frame: TileFrame, resolution: Resolution, dipoles: Sequence[Dipoles]) -> Basis:
     """Return the basis of a box with these sources."""
-    families: list[Family] = [UniformField(UNIFORM_SIGMA)]
-    families.append(modes_up_to(FLOOR, frame.size, 0.0, resolution.floor))
-    families.append(modes_up_to(CEILING, frame.size, frame.height, resolution.ceiling))
-    families += dipoles
+    floor = modes_up_to(FLOOR, frame.size, 0.0, resolution.floor)
+    ceiling = modes_up_to(CEILING, frame.size, frame.height, resolution.ceiling)
+    families: tuple[Family, ...] = (UniformField(UNIFORM_SIGMA), floor, ceiling, *dipoles)
     return Basis(frame, tuple(family for family in families if len(family)))
 
 

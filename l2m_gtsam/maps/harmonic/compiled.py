@@ -11,7 +11,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, TermSum, compile_tile, sources_of
+from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, TermSum, compile_tile
 from l2m_gtsam.maps.harmonic.entries import compiled_entry, finite, floats, integers
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
@@ -200,12 +200,7 @@ def compiled_from_arrays(
         return solved()
     low, high = finite(arrays, "walls", (2, 3))
     grid, near = grid_from_arrays(arrays), near_from_arrays(arrays)
-    return CompiledTile(frame, (low, high), grid, near, lambda: all_terms(solved()))
-
-
-def all_terms(tile: Tile) -> TermSum:
-    """Return all terms of a tile."""
-    return TermSum.of(tile, sources_of(tile))
+    return CompiledTile(frame, (low, high), grid, near, lambda: TermSum.of(solved()))
 
 
 def grid_from_arrays(arrays: Arrays) -> PotentialGrid:

@@ -54,11 +54,11 @@ class TermSum:
     others: tuple[tuple[Family, FloatArray], ...]
 
     @classmethod
-    def of(cls, tile: Tile, sources: PointSources) -> "TermSum":
+    def of(cls, tile: Tile) -> "TermSum":
         """Return the terms of a tile with the mean of its weights, and all of its dipoles."""
         families = zip(tile.basis.families, tile.basis.columns, strict=True)
         others = ((f, tile.weights.mean[at]) for f, at in families if not isinstance(f, Dipoles))
-        return cls(sources, tuple(others))
+        return cls(sources_of(tile), tuple(others))
 
     def field_and_gradient(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the tile's frame."""
@@ -191,12 +191,11 @@ def compile_tile(tile: Tile, places: Places) -> CompiledTile | Tile:
     How fine follows from waves and sources, then from the error at places drawn at random and
     beside sources. If no grid of a sensible size is good enough the exact tile remains.
     """
-    sources = sources_of(tile)
-    checks = check_places(tile, sources, places)
+    terms = TermSum.of(tile)
+    checks = check_places(tile, terms.sources, places)
     if not len(checks):
         return tile
-    fineness = fineness_for(tile, sources)
-    terms = TermSum.of(tile, sources)
+    fineness = fineness_for(tile, terms.sources)
     frame = tile.basis.frame
     truth = in_map(frame, *terms.field_and_gradient(tile.clipped(frame.localise(checks))))
     for _ in range(ATTEMPTS):

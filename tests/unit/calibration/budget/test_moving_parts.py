@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.budget.looked_for import processes
-from l2m_gtsam.calibration.budget.moving_parts import (
+from l2m_gtsam.calibration.budget.sensor_processes import (
     MotionUnits,
     MovingParts,
     motion_numbers,
