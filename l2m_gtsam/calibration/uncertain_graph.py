@@ -8,12 +8,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import (
-    U,
-    UncertainReadings,
-    uncertain_block_factor,
-    uncertain_reading_factor,
-)
+from l2m_factors import U, UncertainReadings, uncertain_block_factor, uncertain_reading_factor
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.coverage import POSE, Coverage, UncertainMap, cover, moving_fields
