@@ -9,10 +9,9 @@ import numpy as np
 
 from l2m_factors import D, Q, U, W
 from l2m_gtsam.calibration.budget.found import spread_of_H
-from l2m_gtsam.calibration.budget.looked_for import processes
+from l2m_gtsam.calibration.budget.looked_for import LAGGING_S, processes
 from l2m_gtsam.calibration.budget.processes import Process, ReadingPlaces, Warp
 from l2m_gtsam.calibration.budget.search import ProcessInformation, process_information
-from l2m_gtsam.calibration.budget.sensor_processes import LAGGING_S
 from l2m_gtsam.calibration.budget.unseen_warp import UnseenWarp
 from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.coverage import Correction, Coverage

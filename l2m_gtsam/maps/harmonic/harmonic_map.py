@@ -15,8 +15,7 @@ from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.pose_sizes import with_pose_errors
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
-from l2m_gtsam.maps.harmonic.suite_found import with_errors_found
-from l2m_gtsam.maps.harmonic.suite_sizes import sized, stated_doubts, suite_sizes
+from l2m_gtsam.maps.harmonic.suite_sizes import sized, stated_doubts, suite_sizes, with_errors_found
 from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tile_shares import Blend, TilePoints

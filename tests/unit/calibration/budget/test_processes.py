@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_factors import PoseMotion, moved
 from l2m_gtsam.calibration.budget.found import spread_of_H
-from l2m_gtsam.calibration.budget.looked_for import processes
+from l2m_gtsam.calibration.budget.looked_for import ClockDrift, processes
 from l2m_gtsam.calibration.budget.processes import (
     LASTING_S,
     FieldProcess,
@@ -20,7 +20,6 @@ from l2m_gtsam.calibration.budget.processes import (
     Warp,
 )
 from l2m_gtsam.calibration.budget.search import FoundProcess
-from l2m_gtsam.calibration.budget.sensor_processes import ClockDrift
 from l2m_gtsam.data import FloatArray, LidarMotion
 from l2m_gtsam.records.error_budget import DisturbanceKind
 from tests.support.scenes import scene
