@@ -156,9 +156,7 @@ def check_by_parts(near: IndependentOptimum) -> UncertainSolution:
 
 
 def of_its_sensor(
-    stated: tuple[StatedSize, ...],
-    found: Sequence[FoundProcess],
-    near: IndependentOptimum,
+    stated: tuple[StatedSize, ...], found: Sequence[FoundProcess], near: IndependentOptimum
 ) -> tuple[StatedSize, ...]:
     """Return sizes where errors of poses are said of the sensor that alone shows them, if one does.
 

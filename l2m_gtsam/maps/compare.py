@@ -174,10 +174,7 @@ class Prediction:
 
 
 def compare_maps(
-    points: FloatArray,
-    field: FloatArray,
-    options: CompareOptions,
-    build: Build,
+    points: FloatArray, field: FloatArray, options: CompareOptions, build: Build
 ) -> MapComparison:
     """Compare kinds of maps on held-out patches of the readings.
 

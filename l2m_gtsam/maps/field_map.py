@@ -5,7 +5,7 @@ from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 
-from l2m_gtsam.data import ARRAYS, FieldSample, FloatArray, MapState, Recording
+from l2m_gtsam.data import ARRAYS, FieldAndGradient, FieldSample, FloatArray, MapState, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.records.map_diary import MapDiary
@@ -130,7 +130,7 @@ class FieldMap(Protocol):
             If a point is not finite or the shape is wrong.
         """
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, also outside of the map.
 
         Never NaN: away from data the field returns to its mean, so that an optimiser may leave

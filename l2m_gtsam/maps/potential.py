@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray
 from l2m_gtsam.options import Options
 
 AXES = 3
@@ -128,9 +128,7 @@ class PotentialBasis:
             found[:, i] += np.einsum("nm,nm->n", by[:, j], mixed)
         return found
 
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, of weights of shape (m,)."""
         return self.features(points) @ weights, self.slopes(points) @ weights
 

@@ -24,7 +24,7 @@ import numpy as np
 from numba import njit
 from pydantic import Field, model_validator
 
-from l2m_gtsam.data import FieldSample, FloatArray, IntArray
+from l2m_gtsam.data import FieldAndGradient, FieldSample, FloatArray, IntArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import masked
 from l2m_gtsam.maps.grid import Grid, grid_over
@@ -133,7 +133,7 @@ class SlidingGP(GPMap[SlidingGPOptions]):
         variance, nearest = self._variance(points)
         return masked(FieldSample(field, gradient, variance, nearest <= self.options.reach**2))
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
         field, gradient = self.sums.mean_and_gradient(points, self.grid.block_of(points))
@@ -233,9 +233,7 @@ class KernelSums:
             alpha=np.ascontiguousarray(alpha.T),
         )
 
-    def mean_and_gradient(
-        self, points: FloatArray, block: IntArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def mean_and_gradient(self, points: FloatArray, block: IntArray) -> FieldAndGradient:
         """Return the mean (N, 3) in uT without its constant and its gradient (N, 3, 3) in uT/m.
 
         Parameters

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, TermSum, compile_tile
 from l2m_gtsam.maps.harmonic.entries import compiled_entry, finite, floats, integers
@@ -142,7 +142,7 @@ class CompiledTiles:
 
         return sum(in_threads(make, indices))
 
-    def blended(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def blended(self, points: FloatArray) -> FieldAndGradient:
         """Return the blended prediction of the tiles at points."""
         blend = Blend.of(len(points))
         for part in self.learnt.tiling.by_tile(points):

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles, add_dipoles
 from l2m_gtsam.maps.harmonic.family import Family
@@ -60,7 +60,7 @@ class TermSum:
         others = ((f, tile.weights.mean[at]) for f, at in families if not isinstance(f, Dipoles))
         return cls(sources_of(tile), tuple(others))
 
-    def field_and_gradient(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, local: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the tile's frame."""
         field, gradient = np.zeros((len(local), 3)), np.zeros((len(local), 3, 3))
         for family, weights in self.others:
@@ -116,7 +116,7 @@ class CompiledTile:
         """All terms of the exact tile."""
         return self.exact()
 
-    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
         blend = Blend.of(len(points))
         self.add_to(blend, points, np.arange(len(points)), np.ones(len(points)))
@@ -149,9 +149,7 @@ class CompiledTile:
             blend.add(rows[left], share[left], values)
 
 
-def in_map(
-    frame: TileFrame, field: FloatArray, gradient: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def in_map(frame: TileFrame, field: FloatArray, gradient: FloatArray) -> FieldAndGradient:
     """Return field (N, 3) and gradient (N, 3, 3) of a tile's frame in the map frame."""
     R = frame.R_map_tile
     if np.array_equal(R, np.eye(3)):

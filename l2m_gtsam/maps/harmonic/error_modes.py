@@ -173,11 +173,7 @@ class MovedTiles:
 
 
 def error_modes(
-    learnt: Learnt,
-    tiles: Tiles,
-    moved: MovedTiles,
-    points: FloatArray,
-    options: ErrorOptions,
+    learnt: Learnt, tiles: Tiles, moved: MovedTiles, points: FloatArray, options: ErrorOptions
 ) -> ErrorModes:
     """Return the error of a map over places.
 

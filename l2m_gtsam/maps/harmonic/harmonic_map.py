@@ -7,7 +7,7 @@ from typing import ClassVar, Self
 import numpy as np
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
+from l2m_gtsam.data import FieldAndGradient, FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, MovedTiles, error_modes, tile_modes
@@ -291,7 +291,7 @@ class HarmonicMap:
     def _compiled(self) -> CompiledTiles:
         return CompiledTiles.of(self.learnt, self.options, self.tiles)
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
         blend = Blend.of(len(points))
@@ -369,7 +369,7 @@ class CompiledMap(HarmonicMap):
     def _answers(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         return *self.field_and_gradient(points), self.variance(points)
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
         if len(points) < SERIAL:

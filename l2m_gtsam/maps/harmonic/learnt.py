@@ -242,11 +242,7 @@ class Learnt:
         return replace(learnt, poses=wrong_poses)
 
     def followed_by(
-        self,
-        new: TrainingSet,
-        options: HarmonicOptions,
-        suite: SuiteErrors | None,
-        drive: MapDrive,
+        self, new: TrainingSet, options: HarmonicOptions, suite: SuiteErrors | None, drive: MapDrive
     ) -> "Learnt":
         """Return the same with the readings of a new drive, which stay apart from earlier ones.
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FieldAndGradient, FloatArray, IntArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.spline import (
     BELOW,
@@ -88,7 +88,7 @@ class PotentialGrid:
     spacing: float
     coefficients: FloatArray
 
-    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m; NaN where not covered.
 
         ``gradient[n, i, j]`` = dB_i/dx_j, symmetric to the last digit. Scattered places wait for

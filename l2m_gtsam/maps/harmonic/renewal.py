@@ -51,10 +51,7 @@ class DriveReadings:
 
 
 def renewed(
-    field_map: HarmonicMap,
-    new: DriveReadings,
-    changes: Sequence[DatedChange],
-    survey: MapDrive,
+    field_map: HarmonicMap, new: DriveReadings, changes: Sequence[DatedChange], survey: MapDrive
 ) -> HarmonicMap:
     """Return a map as a drive found the place.
 

@@ -288,11 +288,7 @@ PASSES = 2
 
 
 def with_errors_found(
-    learnt: Learnt,
-    raw: TrainingSet,
-    suite: SuiteErrors,
-    sources: Sources,
-    options: HarmonicOptions,
+    learnt: Learnt, raw: TrainingSet, suite: SuiteErrors, sources: Sources, options: HarmonicOptions
 ) -> Learnt:
     """Return what readings teach without the errors of their sensors that they show.
 

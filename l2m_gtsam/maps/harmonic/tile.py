@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.evidence import Weights
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
@@ -43,7 +43,7 @@ class Tile:
         """Memory of the covariance, by far the most of it, in bytes."""
         return self.weights.factor.nbytes
 
-    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray) -> FieldAndGradient:
         """Return the mean field (N, 3) in uT and its gradient (N, 3, 3) in uT/m."""
         return self.basis.field_and_gradient(self.within(points), self.weights.mean)
 

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from l2m_gtsam.data import FieldSample, FloatArray, IntArray
+from l2m_gtsam.data import FieldAndGradient, FieldSample, FloatArray, IntArray
 from l2m_gtsam.maps.field_map import WrappedMap
 from l2m_gtsam.maps.sources.found_sources import FoundSources
 from l2m_gtsam.maps.sources.source import SourceShape
@@ -18,7 +18,7 @@ LOOSE = 10.0
 class SurveyedField(Protocol):
     """What a map is asked for that sources are added to."""
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient."""
 
     def query(self, points: FloatArray, /) -> FieldSample:
@@ -113,7 +113,7 @@ class ChangedMap(WrappedMap):
         """Return the same over the form of the map that is asked faster."""
         return ChangedMap(self._map.compile(), self._found)
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient of both."""
         field, gradient = self._map.field_and_gradient(points)
         return self._with_sources(points, field, gradient)
@@ -130,7 +130,7 @@ class ChangedMap(WrappedMap):
 
     def _with_sources(
         self, points: FloatArray, field: FloatArray, gradient: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> FieldAndGradient:
         for shape in self._found.shapes:
             b, G = shape.field_and_gradient(points)
             field, gradient = field + b, gradient + G
