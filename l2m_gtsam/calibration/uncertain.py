@@ -236,10 +236,7 @@ def start_with(
 
 def with_processes(found: Settled, budget: Budget, shown: Searched) -> gtsam.Values:
     """Return where the optimum is with processes that are no errors of poses, to first order."""
-    delta = gtsam.VectorValues()
-    for key, at in found.optimum.joint.columns.items():
-        delta.insert(key, shown.moved[at])
-    values = found.optimum.values.retract(delta)
+    values = found.optimum.joint.stepped(found.optimum.values, shown.moved)
     # Each has a variable of its own.
     for key, weights in zip(budget.variables, shown.weights, strict=True):
         values.insert(key, weights)

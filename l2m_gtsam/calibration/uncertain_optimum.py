@@ -35,7 +35,7 @@ from l2m_gtsam.calibration.stated_sizes import (
     size_of_shared,
 )
 from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
-from l2m_gtsam.calibration.variance_parts import PriorRows, variance_parts
+from l2m_gtsam.calibration.variance_parts import variance_parts
 from l2m_gtsam.calibration.view import View
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import ErrorCause, StatedSize
@@ -181,9 +181,8 @@ class UncertainOptimum:
 
     def by_cause(self, solved: Sequence[SensorSolution]) -> tuple[SensorSolution, ...]:
         """Return solutions with what each cause has of their variances."""
-        prior = PriorRows.of(self._coverage.columns, self.problem.drive.prior.information)
-        sensors = [each.sensor for each in solved]
-        parts = variance_parts(self.joint, prior, self.problem.noise, sensors)
+        problem, sensors = self.problem, [each.sensor for each in solved]
+        parts = variance_parts(self.joint, problem.drive.prior, problem.noise, sensors)
         pairs = zip(solved, parts, strict=True)
         return tuple(replace(each, variances=own) for each, own in pairs)
 

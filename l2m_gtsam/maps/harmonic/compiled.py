@@ -18,9 +18,8 @@ from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.near_sources import NearSources
 from l2m_gtsam.maps.harmonic.places import AlongX, Places
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid
-from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_shares import Blend
-from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.maps.harmonic.tiles import Tile, Tiles
 from l2m_gtsam.maps.tile_store import Arrays, Entry
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.progress import Count

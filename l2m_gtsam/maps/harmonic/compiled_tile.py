@@ -23,8 +23,8 @@ from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, near_sources
 from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid, PotentialLattice, potential_grid
-from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_shares import Blend
+from l2m_gtsam.maps.harmonic.tiles import Tile
 from l2m_gtsam.maps.harmonic.tiling import WAVE_NUMBERS
 
 FIELD_TOLERANCE = 0.005  # uT

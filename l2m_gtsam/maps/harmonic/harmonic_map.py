@@ -186,7 +186,13 @@ class HarmonicMap:
             for index, cell in enumerate(learnt.tiling.grid.cells.tolist())
             if not touched[index] and old.get(tuple(cell)) in solved
         }
-        return HarmonicMap(learnt, self.options, Tiles(learnt, kept), frame=self.frame)
+        return self._formed(
+            HarmonicMap(learnt, self.options, Tiles(learnt, kept), frame=self.frame)
+        )
+
+    def _formed(self, plain: "HarmonicMap") -> "HarmonicMap":
+        """Return a map in the form that this one has."""
+        return plain
 
     @classmethod
     def from_state(cls, state: MapState) -> "HarmonicMap":
@@ -382,16 +388,8 @@ class CompiledMap(HarmonicMap):
         in_threads(answer, np.array_split(by_place(points), max(SHARES, len(points) // PIECE)))
         return field, gradient
 
-    def updated(
-        self,
-        points: FloatArray,
-        field: FloatArray,
-        suite: SuiteErrors | None = None,
-        poses: SurveyPoses | None = None,
-        /,
-    ) -> "CompiledMap":
-        """Return the map with more readings; see ``FieldMap``."""
-        return super().updated(points, field, suite, poses).compile()
+    def _formed(self, plain: HarmonicMap) -> HarmonicMap:
+        return plain.compile()
 
 
 def by_place(points: FloatArray) -> IntArray:

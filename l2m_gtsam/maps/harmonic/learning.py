@@ -141,7 +141,9 @@ def learn(
         # Finer modes than those in the windows would have changed their likelihood.
         if needed.floor < FINER * looked_at.floor and needed.ceiling < FINER * looked_at.ceiling:
             break
-    return replace(end, roughest=tuple(own(each, end.hyperparameters) for each in windows.rough))
+    of_map, local = end.hyperparameters, LocalOptions()
+    rough = (local_hyperparameters(w.basis, w.normal, of_map, local) for w in windows.rough)
+    return replace(end, roughest=tuple(rough))
 
 
 def starting_point(readings: TrainingSet) -> Hyperparameters:
@@ -171,11 +173,6 @@ def draw_windows(
     spread = spread_tiles(tiling, members, learning.windows)
     rough = rough_tiles(readings, members, learning.rough, spread)
     return Windows([window(tile) for tile in spread], [window(tile) for tile in rough])
-
-
-def own(window: Window, hyperparameters: Hyperparameters) -> Hyperparameters:
-    """Return the scales and depths of a window by itself."""
-    return local_hyperparameters(window.basis, window.normal, hyperparameters, LocalOptions())
 
 
 def window_of(

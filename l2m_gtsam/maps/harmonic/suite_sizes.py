@@ -55,8 +55,7 @@ from l2m_gtsam.maps.harmonic.error_modes import moved_weights
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.teaching import learn_map
-from l2m_gtsam.maps.harmonic.tile import TileModes
-from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.maps.harmonic.tiles import TileModes, Tiles
 from l2m_gtsam.maps.suite_errors import SIZE, FoundErrors, SuiteErrors
 from l2m_gtsam.maps.training import TrainingSet, cubes_of
 from l2m_gtsam.parallel.threads import in_threads

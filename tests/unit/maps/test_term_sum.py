@@ -11,7 +11,7 @@ from l2m_gtsam.maps.harmonic.evidence import Weights
 from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
-from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tiles import Tile
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
 
