@@ -7,6 +7,7 @@ from scipy.optimize import Bounds, OptimizeResult, minimize
 
 from l2m_gtsam.data import BoolArray, FloatArray
 
+STEPS, TOLERANCE = 15_000, 2.220446049250313e-09  # those of SciPy itself
 ON_BOUND = 1e-6  # of a logarithm: so near a bound, a search has run into it
 
 Cost = Callable[[FloatArray], tuple[float, FloatArray]]
@@ -18,7 +19,8 @@ def minimised(
     start: FloatArray,
     low: FloatArray | float,
     high: FloatArray | float,
-    **options: float,
+    steps: int = STEPS,
+    tolerance: float = TOLERANCE,
 ) -> OptimizeResult:
     """Return where a cost is least between bounds, by L-BFGS-B.
 
@@ -28,11 +30,19 @@ def minimised(
         What is minimised.
     start, low, high
         Where to begin, and the bounds, shape (n,) each.
-    options
-        Of ``scipy.optimize.minimize``.
+    steps
+        The most that are taken.
+    tolerance
+        Relative decrease of the cost that ends the search.
     """
-    bounds = Bounds(low, high)
-    return minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return minimize(
+        cost,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=Bounds(low, high),
+        options={"maxiter": steps, "ftol": tolerance},
+    )
 
 
 def on_bound(x: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:

@@ -285,7 +285,7 @@ def shared_components(
         now = climb if squares is None or round_ == ROUNDS - 1 else SHORT
         white = [each.whiter(noise) for each in systems]
         cost = partial(_cost, white, spectra)
-        end = minimised(cost, start, low, high, maxiter=now.steps, ftol=now.tolerance)
+        end = minimised(cost, start, low, high, now.steps, now.tolerance)
         start = end.x
         sizes = np.where(start > unit + np.log(2 * NEGLIGIBLE), np.exp(start), 0.0)
         found = VarianceComponents(sizes, -2 * float(end.fun), noise)

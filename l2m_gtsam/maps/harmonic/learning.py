@@ -206,7 +206,7 @@ def maximise(
         )
         return -sum(part.value for part in parts), -gradient
 
-    end = minimised(cost, x0, low, high, maxiter=60, ftol=1e-6)
+    end = minimised(cost, x0, low, high, steps=60, tolerance=1e-6)
     at_bound = tuple(compress(names, on_bound(end.x, low, high)))
     return LearningEnd(
         hyperparameters=moved(start, names, end.x),

@@ -214,7 +214,8 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
         slope = np.bincount(owner, result.slopes().by_log_variance).astype(np.float64)
         return -result.value, -2 * slope
 
-    end = minimised(cost, start, *np.log(RANGE), maxiter=STEPS, ftol=1e-7)
+    low, high = np.log(RANGE)
+    end = minimised(cost, start, low, high, STEPS, 1e-7)
     determined = determined_weights(alone, given + 2 * (end.x - start)[owner], noise)
     # Effective number of weights that the readings determine (MacKay 1992), by structure.
     count = np.bincount(owner, determined)
