@@ -21,8 +21,7 @@ from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.solve.linear_algebra import lower_information_root, right_divided
-from l2m_gtsam.solve.row_blocks import RowBlocks
+from l2m_gtsam.solve.linear_algebra import RowBlocks, lower_information_root, right_divided
 
 # What is known of a sensor's t, C row by row, H and time offset here: next to nothing, beside what
 # the readings of a drive determine.

@@ -219,13 +219,12 @@ def stated_doubts(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> tuple[str
     if found is None or not found.is_wrong or (found.ratio < 1 and suite.calibrated_together):
         return ()
     wrong = "too small" if found.ratio > 1 else "too large"
-    return (
-        (
-            f"the sigmas stated of the survey's sensors are {wrong}: by the survey their C and H "
-            f"are off by {found.ratio:.2g} times as much, and sigmas of a calibration are {wrong}; "
-            "correct them (--suite)"
-        ),
+    doubt = (
+        f"the sigmas stated of the survey's sensors are {wrong}: by the survey their C and H are "
+        f"off by {found.ratio:.2g} times as much, and sigmas of a calibration are {wrong}; correct "
+        "them (--suite)"
     )
+    return (doubt,)
 
 
 def survey_view(learnt: Learnt, tiles: Tiles, suite: SuiteErrors, turned: FloatArray) -> TileView:
