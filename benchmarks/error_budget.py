@@ -18,7 +18,7 @@ from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.one_key import settle, solve_one_key
 from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
 from l2m_gtsam.calibration.uncertain import solve_uncertain
-from l2m_gtsam.calibration.uncertain_graph import UncertainDrive
+from l2m_gtsam.calibration.uncertain_graph import IndependentOptimum, UncertainDrive
 from l2m_gtsam.calibration.uncertain_rounds import settle_by_any
 from l2m_gtsam.calibration.view import RememberedMap, StandIns
 from l2m_gtsam.data import FloatArray, Readings
@@ -105,15 +105,13 @@ def cost(field_map: CompiledMap, readings: Readings) -> Cost:
         raise RuntimeError("no sensor has enough readings")
     view = joint.problem.view
     tests = joint_problem(view, asked, joint.estimate, OPTIONS).determinacies
-    given = (view, asked, asked, joint.estimate)
-    drive = UncertainDrive.of(*given, OPTIONS)
-    settle_by_any(drive, joint.estimate, tests, OPTIONS, lambda _: None)  # tiles are compiled
+    optimum = IndependentOptimum(view, asked, asked, joint.estimate, tests, OPTIONS)
+    settle_by_any(UncertainDrive.of(optimum), joint.estimate, lambda _: None)  # compiles tiles
     began = process_time()
-    drive = UncertainDrive.of(*given, OPTIONS)
-    found = settle_by_any(drive, joint.estimate, tests, OPTIONS, lambda _: None)
+    found = settle_by_any(UncertainDrive.of(optimum), joint.estimate, lambda _: None)
     found.optimum.solutions()
     between = process_time()
-    whole = solve_uncertain(*given, tests, OPTIONS, lambda _: None)
+    whole = solve_uncertain(optimum, lambda _: None)
     kinds = sorted({each.process.kind.value for each in whole.budget.found})
     ended = process_time()
     solve_one_key(readings, RememberedMap(field_map), start.t + BESIDE_M, OPTIONS)

@@ -16,10 +16,15 @@ from benchmarks.one_key import NOISE, hall, survey
 from benchmarks.timing import seconds
 from l2m_factors import map_weights_prior
 from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
-from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm
+from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.optimise import LinearSolver
-from l2m_gtsam.calibration.uncertain_graph import UncertainDrive, UncertainProblem, starting_values
+from l2m_gtsam.calibration.uncertain_graph import (
+    IndependentOptimum,
+    UncertainDrive,
+    UncertainProblem,
+    starting_values,
+)
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
@@ -56,7 +61,7 @@ class Case:
 
     def round(self) -> list[FloatArray]:
         """Return covariances after a descent, degrees of freedom and marginals by GTSAM."""
-        values = self.problem.descend(self.values, OPTIONS, LinearSolver.CHOLESKY).values
+        values = self.problem.descend(self.values, LinearSolver.CHOLESKY).values
         solved = UncertainOptimum.at(self.problem, values).solutions()
         return [each.joint_covariance for each in solved]
 
@@ -108,8 +113,9 @@ def case(field_map: CompiledMap, count: int, each: int) -> Case:
     estimate: Estimate = replace(start, distortion=truth, noise=np.full(count, NOISE))
     view = observe(readings, field_map, estimate, OPTIONS.min_readings)
     tests = joint_problem(view, field_map, estimate, OPTIONS).determinacies
-    drive_ = UncertainDrive.of(view, field_map, field_map, estimate, OPTIONS)
-    problem = UncertainProblem(drive_, estimate, tests, FactorForm.BLOCK)
+    optimum = IndependentOptimum(view, field_map, field_map, estimate, tests, OPTIONS)
+    drive_ = UncertainDrive.of(optimum)
+    problem = UncertainProblem(drive_, estimate)
     coverage = drive_.prior.coverage
     rows = gtsam.NonlinearFactorGraph()
     information = drive_.prior.graph.at(0)

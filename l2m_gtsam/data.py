@@ -17,6 +17,7 @@ from pydantic_core import CoreSchema, core_schema
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+FieldAndGradient = tuple[FloatArray, FloatArray]  # (N, 3) in uT and (N, 3, 3) in uT/m
 ARRAYS = "(arrays)"  # in place of the path of what was made of arrays, not read from a file
 
 

@@ -1,6 +1,5 @@
 """GTSAM factors for magnetometers in a mapped field."""
 
-from l2m_factors.any_pose import magnetic_pose_factor
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.complexity import (
     ComplexityPenalty,
@@ -8,7 +7,6 @@ from l2m_factors.complexity import (
     effective_parameters_factor,
 )
 from l2m_factors.field_map import DifferentiableMap
-from l2m_factors.fixed_axes_step import fixed_axes_step_factor
 from l2m_factors.joint_residual import Residual, joint_residual
 from l2m_factors.key_pose_readings import (
     Calibrations,
@@ -18,7 +16,7 @@ from l2m_factors.key_pose_readings import (
 )
 from l2m_factors.keys import A, B, D, F, G, K, L, M, N, P, Q, S, T, U, V, W, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
-from l2m_factors.pose import MapBatch, key_pose_factor
+from l2m_factors.pose import MapBatch, key_pose_factor, magnetic_pose_factor
 from l2m_factors.priors import distance_prior, distortion_prior, held_directions, rotation_prior
 from l2m_factors.reading import BatchedReadings, block_factor, reading_factor
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, field_rate, reading_residuals
@@ -34,8 +32,14 @@ from l2m_factors.shared_errors import (
     uncertain_reading_factor,
 )
 from l2m_factors.slow_error import SlowBridge, SlowError, slow_bridge, slow_error_graph
-from l2m_factors.steady_drift import drift_weights, drifting_fixed_axes_step, drifting_step
-from l2m_factors.step import StepError, scaled_step_factor
+from l2m_factors.step import (
+    StepError,
+    drift_weights,
+    drifting_fixed_axes_step,
+    drifting_step,
+    fixed_axes_step_factor,
+    scaled_step_factor,
+)
 from l2m_factors.tile import (
     TileBatch,
     TileField,

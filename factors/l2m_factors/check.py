@@ -63,13 +63,8 @@ def _central_difference(
 def _whitened_error(
     factor: gtsam.NonlinearFactor, values: gtsam.Values, key: int, delta: FloatArray
 ) -> FloatArray:
-    tangent = values.zeroVectors()
-    tangent.update(_single(key, delta))
+    tangent, own = values.zeroVectors(), gtsam.VectorValues()
+    own.insert(key, delta)
+    tangent.update(own)
     _, b = factor.linearize(values.retract(tangent)).jacobian()
     return np.asarray(-b)
-
-
-def _single(key: int, delta: FloatArray) -> gtsam.VectorValues:
-    tangent = gtsam.VectorValues()
-    tangent.insert(key, delta)
-    return tangent

@@ -21,8 +21,7 @@ from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.solve.linear_algebra import lower_information_root, right_divided
-from l2m_gtsam.solve.row_blocks import RowBlocks
+from l2m_gtsam.solve.linear_algebra import RowBlocks, lower_information_root, right_divided
 
 # What is known of a sensor's t, C row by row, H and time offset here: next to nothing, beside what
 # the readings of a drive determine.
@@ -181,28 +180,28 @@ def nuisances(
     beside = process_shares(readings, field_map, estimate, budget)
     size = last + sum(features.shape[2] for _, features in beside)
     starts = dict(zip(coverage.tiles, np.cumsum([0, *coverage.tiles.values()]), strict=False))
-    design = _Sparse(len(readings), size)
+    parts = []
     _, gradient = field_map.field_and_gradient(places_of(readings, estimate.t))
     for group in coverage.groups:
-        design.add(group.rows, int(starts[group.tile]), group.features)
+        parts.append(_entries(group.rows, int(starts[group.tile]), group.features))
         if suite:
             moved = group.common - gradient[group.rows] @ coverage.shift
-            design.add(group.rows, tiles, moved)
+            parts.append(_entries(group.rows, tiles, moved))
     for sensor in np.unique(readings.sensor).tolist():
         rows = np.arange(len(readings))[readings.rows_of(sensor)]
-        design.add(
-            rows, first + SENSOR * sensor, sensor_shares(readings, rows, field_map, estimate)
-        )
+        own = sensor_shares(readings, rows, field_map, estimate)
+        parts.append(_entries(rows, first + SENSOR * sensor, own))
     at = last
     for rows, features in beside:
-        design.add(rows, at, features)
+        parts.append(_entries(rows, at, features))
         at += features.shape[2]
     prior = np.eye(size)
     prior[:tiles, :tiles] = coverage.tile_information
     prior[range(tiles, first), range(tiles, first)] = coverage.spread**-2
-    own = range(first, last)
-    prior[own, own] = np.tile(WIDE**-2, len(readings.sensors))
-    return design.matrix(), prior
+    of_sensors = range(first, last)
+    prior[of_sensors, of_sensors] = np.tile(WIDE**-2, len(readings.sensors))
+    values, *places = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return coo_array((values, tuple(places)), shape=(3 * len(readings), size)).tocsr(), prior
 
 
 def process_shares(
@@ -254,21 +253,11 @@ def with_calibration(rows: MarginalRows, covariances: FloatArray) -> MarginalRow
     return replace(rows, prior=prior)
 
 
-class _Sparse:
-    """Entries of a matrix of three rows for each reading."""
-
-    def __init__(self, readings: int, columns: int) -> None:
-        self._shape = 3 * readings, columns
-        self._parts: list[tuple[FloatArray, IntArray, IntArray]] = []
-
-    def add(self, rows: IntArray, first: int, values: FloatArray) -> None:
-        """Add values, shape (n, 3, k), of readings from a column on."""
-        n, _, k = values.shape
-        at = np.broadcast_to((3 * rows[:, None] + np.arange(3))[:, :, None], (n, 3, k))
-        columns = np.broadcast_to(first + np.arange(k), (n, 3, k))
-        self._parts.append((values.ravel(), at.ravel(), columns.ravel()))
-
-    def matrix(self) -> csr_array:
-        """Return the matrix; entries at one place add up."""
-        values, rows, columns = (np.concatenate(each) for each in zip(*self._parts, strict=True))
-        return coo_array((values, (rows, columns)), shape=self._shape).tocsr()
+def _entries(
+    rows: IntArray, first: int, values: FloatArray
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Return values, shape (n, 3, k), of readings from a column on, their rows and columns."""
+    n, _, k = values.shape
+    at = np.broadcast_to((3 * rows[:, None] + np.arange(3))[:, :, None], (n, 3, k))
+    columns = np.broadcast_to(first + np.arange(k), (n, 3, k))
+    return values.ravel(), at.ravel(), columns.ravel()

@@ -307,14 +307,8 @@ def _with_missing(
     sensor: SensorCalibration, readings: Readings, recording: Recording
 ) -> SensorCalibration:
     """Return the same with the drives in which nothing usable was read of it."""
-    own = (
-        readings.drive
-        if readings.drive is None
-        else readings.drive[readings.rows_of(readings.sensors.index(sensor.sensor))]
-    )
-    missing = [
-        drive.source.path for k, drive in enumerate(recording.drives) if not np.any(own == k)
-    ]
+    own = readings.of_drive[readings.rows_of(readings.sensors.index(sensor.sensor))]
+    missing = [drive.source.path for k, drive in enumerate(recording.drives) if k not in own]
     return replace(sensor, missing_in=tuple(missing)) if missing else sensor
 
 

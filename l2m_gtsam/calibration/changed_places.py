@@ -13,9 +13,8 @@ import numpy as np
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive, pose_shares
 from l2m_gtsam.calibration.averages import AveragingOptions, averaged
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
-from l2m_gtsam.calibration.causes import offset_gain
 from l2m_gtsam.calibration.coverage import UncertainMap, errors_over_stated
-from l2m_gtsam.calibration.drive_sources import drive_sources
+from l2m_gtsam.calibration.drive_sources import drive_sources, offset_gain
 from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, places_of

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
 from l2m_gtsam.calibration.optimise import clusters_of
-from l2m_gtsam.calibration.priors import HOLD_S, Prior, Priors, prior_rows
+from l2m_gtsam.calibration.priors import HOLD_S, Priors, prior_rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_among, rows_in
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.solve.rank import PARAMETERS, Determinacy, RankOptions, timed_determinacy
@@ -82,17 +82,13 @@ class Cluster:
     def rows_of(self, sensor: int, priors: Priors) -> FloatArray:
         """Return rows on one sensor that say what all do when the others are unknown, (M, 16)."""
         others = [other for other in self.sensors if other != sensor]
-        rows = [self._of_readings(), *map(self._of_prior, priors.each), *map(self._loose, others)]
+        readings = block_diag(*(self.jacobians[sensor] for sensor in self.sensors))
+        known = [prior_rows(each, self.values, self.sensors)[0] for each in priors.each]
+        rows = [readings, *known, *map(self._loose, others)]
         columns = columns_among(self.sensors, (*others, sensor))
         triangular = np.asarray(np.linalg.qr(np.concatenate(rows)[:, columns], mode="r"))
         first = SENSOR * len(others)
         return triangular[first:, first:]
-
-    def _of_readings(self) -> FloatArray:
-        return np.asarray(block_diag(*(self.jacobians[sensor] for sensor in self.sensors)))
-
-    def _of_prior(self, prior: Prior) -> FloatArray:
-        return prior_rows(prior, self.values, self.sensors)[0]
 
     def _loose(self, other: int) -> FloatArray:
         """Return rows that keep another sensor's parameters finite and its offset where held."""

@@ -14,7 +14,12 @@ from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution, joint_problem, sensor_solutions
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.uncertain_graph import UncertainDrive, UncertainProblem, starting_values
+from l2m_gtsam.calibration.uncertain_graph import (
+    IndependentOptimum,
+    UncertainDrive,
+    UncertainProblem,
+    starting_values,
+)
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import QueryableMap, StandIns, View, glimpse, observe
 from l2m_gtsam.data import FloatArray, Readings
@@ -95,10 +100,11 @@ def stated_at(
     problem = joint_problem(view, field_map, estimate, options)
     if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
         # With the map's error, of which nothing is known yet, in the graph.
-        drive = UncertainDrive.of(view, field_map, field_map, estimate, options)
+        tests = problem.determinacies
+        near = IndependentOptimum(view, field_map, field_map, estimate, tests, options)
+        drive = UncertainDrive.of(near)
         values = starting_values(estimate, view.sensors, drive.prior.coverage)
-        shared = UncertainProblem(drive, estimate, problem.determinacies, options.factors)
-        optimum = UncertainOptimum.at(shared, values)
+        optimum = UncertainOptimum.at(UncertainProblem(drive, estimate), values)
         solved = optimum.solutions()
         if options.warp_m > 0:
             unseen = foretold_warp(optimum.informed_of_warp(), options.warp_m)

@@ -145,29 +145,23 @@ def group_noise(
         for group in coverage.groups
     ]
     pose = pose_share(readings, field_map, coverage, estimate)
-    if pose is None:
-        W = whitening(own)
-        return GroupNoise(
-            errors=tuple(shared),
-            whitenings=tuple(W[group.rows] for group in coverage.groups),
-            alone=W,
-            sensor=sensor,
-            of_map=_mean_variance(share),
-            of_poses=np.zeros(len(readings)),
-            pose=None,
-        )
     left, whitenings = np.zeros_like(share), []
-    for group in coverage.groups:
-        each, covariance = np.arange(len(group.rows)), pose.bridge(group)
-        blocks = covariance.reshape(len(each), 3, len(each), 3)  # a view
-        left[group.rows] = blocks[each, :, each]
-        blocks[each, :, each] += own[group.rows]
-        whitenings.append(lower_information_root(covariance))
-    pairs = zip(shared, coverage.groups, strict=True)
+    if pose is None:
+        alone = whitening(own)
+        whitenings = [alone[group.rows] for group in coverage.groups]
+    else:
+        for number, group in enumerate(coverage.groups):
+            each, covariance = np.arange(len(group.rows)), pose.bridge(group)
+            blocks = covariance.reshape(len(each), 3, len(each), 3)  # a view
+            left[group.rows] = blocks[each, :, each]
+            blocks[each, :, each] += own[group.rows]
+            whitenings.append(lower_information_root(covariance))
+            shared[number] = (*shared[number], *pose.errors(group))
+        alone = whitening(own + left)
     return GroupNoise(
-        errors=tuple((*each, *pose.errors(group)) for each, group in pairs),
+        errors=tuple(shared),
         whitenings=tuple(whitenings),
-        alone=whitening(own + left),
+        alone=alone,
         sensor=sensor,
         of_map=_mean_variance(share),
         of_poses=_mean_variance(left),

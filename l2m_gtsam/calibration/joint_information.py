@@ -271,11 +271,11 @@ class JointInformation:
         """Return the longest step of some sensors in standard deviations."""
         return max(self.sigmas(sensor) for sensor in sensors)
 
-    def stepped(self, values: gtsam.Values) -> gtsam.Values:
+    def stepped(self, values: gtsam.Values, step: FloatArray | None = None) -> gtsam.Values:
         """Return the values after the step."""
-        delta = gtsam.VectorValues()
+        delta, step = gtsam.VectorValues(), self.step if step is None else step
         for key, at in self.columns.items():
-            delta.insert(key, self.step[at])
+            delta.insert(key, step[at])
         return values.retract(delta)
 
     def taken(self, sensor: int) -> float:

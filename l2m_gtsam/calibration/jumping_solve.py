@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from l2m_gtsam.calibration.averages import Averages
-from l2m_gtsam.calibration.causes import REJECTED
 from l2m_gtsam.calibration.changed_places import (
     ChangesOptions,
     averaged_drive,
@@ -21,6 +20,7 @@ from l2m_gtsam.calibration.changed_places import (
     suspected,
 )
 from l2m_gtsam.calibration.coverage import Correction, UncertainMap
+from l2m_gtsam.calibration.drive_sources import REJECTED
 from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
 from l2m_gtsam.calibration.offset_courses import courses_of
 from l2m_gtsam.calibration.one_key import OneKeySolution

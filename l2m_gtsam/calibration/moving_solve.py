@@ -6,7 +6,7 @@ that field does not change any more. What is left of it is a variable of the gra
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -133,7 +133,7 @@ class MovingSolution:
     readings: Readings
     compared: dict[int, ModelComparison]
     not_compared: dict[int, str]
-    moving: dict[int, tuple[MovingField, ...]]
+    moving: dict[int, tuple[MovingField, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ class MovingProblem:
             self.priors,
         )
         compared, not_compared = self._compared(solution)
-        return Round(fields, given, solution, compared, not_compared)
+        return Round(fields, MovingSolution(solution, given, compared, not_compared))
 
     def _compared(
         self, solution: OneKeySolution
@@ -236,26 +236,19 @@ class Round:
     ----------
     fields
         What was taken off of the sensors that some act on.
-    given
-        The readings without that.
-    solution
-        Of them.
-    compared, not_compared
-        Models of each sensor, or why there are none.
+    outcome
+        Of the readings without that.
     """
 
     fields: Mapping[int, Correction]
-    given: Readings
-    solution: OneKeySolution
-    compared: dict[int, ModelComparison]
-    not_compared: dict[int, str]
+    outcome: MovingSolution
 
     def found(self) -> dict[int, Correction]:
         """Return the fields of numbers for all sensors to which they are recommended."""
-        left = {each.sensor: each.moving for each in self.solution.solved}
+        left = {each.sensor: each.moving for each in self.outcome.solution.solved}
         return {
             sensor: _total(comparison, self.fields.get(sensor), left[sensor])
-            for sensor, comparison in self.compared.items()
+            for sensor, comparison in self.outcome.compared.items()
             if comparison.recommended.has_regressors
         }
 
@@ -292,20 +285,15 @@ def solve_moving(problem: MovingProblem, t_start: FloatArray) -> MovingSolution:
     for _ in range(ROUNDS):
         if last.settled(found):
             break
-        last = problem.solved(_places(last.solution, t_start), found)
+        last = problem.solved(_places(last.outcome.solution, t_start), found)
         # A sensor that the numbers turn out not to help is solved without them, for good.
         given_up |= found.keys() - last.found().keys()
         found = {s: each for s, each in last.found().items() if s not in given_up}
-    return MovingSolution(
-        solution=last.solution,
-        readings=last.given,
-        compared=last.compared,
-        not_compared=last.not_compared,
-        moving={
-            sensor: _named(problem.names, found.get(sensor, taken_off))
-            for sensor, taken_off in last.fields.items()
-        },
-    )
+    moving = {
+        sensor: _named(problem.names, found.get(sensor, taken_off))
+        for sensor, taken_off in last.fields.items()
+    }
+    return replace(last.outcome, moving=moving)
 
 
 def without(readings: Readings, fields: Mapping[int, Correction]) -> Readings:

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive
-from l2m_gtsam.calibration.causes import gains, sensor_offsets
+from l2m_gtsam.calibration.drive_sources import gains, sensor_offsets
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.sources.found_sources import price
 from l2m_gtsam.maps.sources.marginal import MarginalRows

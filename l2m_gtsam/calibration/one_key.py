@@ -12,18 +12,13 @@ Where the lidar's motion separates a sensor's time offset from its place, ``S(i)
 too; the readings' poses are taken anew as it moves.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import (
-    Alternated,
-    OneKeyOptions,
-    alternate,
-    start_estimate,
-)
+from l2m_gtsam.calibration.alternation import Alternated, OneKeyOptions, alternate, start_estimate
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.contradiction import is_contradicted
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
@@ -49,6 +44,7 @@ from l2m_gtsam.calibration.uncertain import (
     solve_uncertain,
     step_uncertain,
 )
+from l2m_gtsam.calibration.uncertain_graph import IndependentOptimum
 from l2m_gtsam.calibration.view import (
     REOBSERVE_M,
     QueryableMap,
@@ -70,7 +66,7 @@ from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.records.error_budget import PoseDuration, StatedSize
-from l2m_gtsam.solve.rank import Determinacy, RankOptions
+from l2m_gtsam.solve.rank import RankOptions
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or
 # three rounds, and a set of readings that keeps hopping over the map's edge is cut off here.
@@ -147,11 +143,6 @@ class OneKeySolution:
     def placed(self) -> tuple[int, ...]:
         """Solved sensors whose place is an optimum in the map."""
         return tuple(each.sensor for each in self.solved if each.sensor not in self.stayed)
-
-    @property
-    def settled(self) -> bool:
-        """Whether estimate and weights agree: another round would repeat the last."""
-        return not self.unsettled | self.stayed
 
 
 def solve_one_key(
@@ -232,12 +223,6 @@ def solve_by_parts(
     return found.by_parts
 
 
-SharedFinish = Callable[
-    [View, QueryableMap, UncertainMap, Estimate, Mapping[int, Determinacy], OneKeyOptions],
-    UncertainSolution,
-]
-
-
 @dataclass(frozen=True)
 class Finish:
     """How covariances come from the optimum with independent errors.
@@ -251,7 +236,7 @@ class Finish:
     """
 
     independent: Callable[[JointProblem, Estimate], tuple[SensorSolution, ...]]
-    shared: SharedFinish
+    shared: Callable[[IndependentOptimum], UncertainSolution]
 
 
 @one_blas_thread()
@@ -265,18 +250,18 @@ def _solved(
     priors: Priors,
     finish: Finish,
 ) -> OneKeySolution:
-    field_map = remembered(field_map)
+    asked = remembered(field_map)
     stand_ins = StandIns.of(readings, options.fewer_readings)
     keep = spread(readings, options.some_readings)
     some, of_some = readings.select(keep), stand_ins.select(keep)
-    good = plausible(some, of_some.sample(some, field_map, t_start, t_start), options.robust)
+    good = plausible(some, of_some.sample(some, asked, t_start, t_start), options.robust)
     some, of_some = some.select(good), of_some.select(good)
     start = start_estimate(t_start, options, priors)
-    near = alternate(some, of_some, field_map, start, options, progress)
+    near = alternate(some, of_some, asked, start, options, progress)
     if options.sensor_noise_ut is None:
-        readings = with_drive_noise(readings, stand_ins, field_map, near)
-    joint = settle(readings, stand_ins, field_map, near, options, progress, trajectory)
-    alone = stayed(joint.stayed, joint.readings, field_map, joint.estimate, options)
+        readings = with_drive_noise(readings, stand_ins, asked, near)
+    joint = settle(readings, stand_ins, asked, near, options, progress, trajectory)
+    alone = stayed(joint.stayed, joint.readings, asked, joint.estimate, options)
     joint = replace(joint, estimate=alone.estimate)
     outcome = OneKeySolution(
         readings=joint.readings,
@@ -292,19 +277,17 @@ def _solved(
     if joint.problem is None:
         return outcome
     view, tests = joint.problem.view, joint.problem.determinacies
-    errors = shared_errors(field_map, view.readings, options.uncertainty)
+    errors = shared_errors(asked, view.readings, options.uncertainty)
     contradicted = is_contradicted(view, joint.estimate, tests)
     if errors is None or contradicted:
         found = in_order(finish.independent(joint.problem, joint.estimate), alone.solved)
         return replace(outcome, solved=found, contradicted=contradicted)
-    if duration := duration_of_poses(
-        view, field_map, joint.estimate, options.pose_noise, trajectory
-    ):
-        pose_noise = options.pose_noise.lasting(duration.seconds)
-        options = options.model_copy(update={"pose_noise": pose_noise})
-    full = finish.shared(view, field_map, errors, joint.estimate, tests, options)
-    if isinstance(field_map, RememberedMap):
-        remember_near(field_map, joint, full.estimate)
+    poses = options.pose_noise
+    if duration := duration_of_poses(view, asked, joint.estimate, poses, trajectory):
+        options = options.model_copy(update={"pose_noise": poses.lasting(duration.seconds)})
+    optimum = IndependentOptimum(view, asked, errors, joint.estimate, tests, options)
+    full = finish.shared(optimum)
+    remember_near(asked, joint, full.estimate)
     unshared = isinstance(errors, NothingShared)
     return replace(
         outcome,

@@ -7,12 +7,11 @@ from enum import StrEnum
 import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from l2m_factors import T
 from l2m_gtsam.calibration.sensor_columns import PLACES, columns_among, columns_of, keys_of
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.solve.linear_algebra import parts_of
 
 # Smallest decrease of the error that counts, relative and absolute (GTSAM's own). A descent only
 # has to come near: polishing ends it, and what remains is judged in standard deviations.
@@ -100,9 +99,7 @@ def polish(
     descent stops at them, a third of a standard deviation early in the simulated warehouse; the
     gradient does not see them. A rise of the error beyond what such steps make is refused.
     """
-    params = gtsam.GaussNewtonParams()
-    _limit(params, steps, solver, TOLERANCE)
-    engine = gtsam.GaussNewtonOptimizer(graph, values, params)
+    engine = _engine(graph, values, Optimizer.GN, steps, solver, TOLERANCE)
     worst = most_after_step(engine.error())
     try:
         for _ in range(steps):
@@ -226,11 +223,7 @@ def clusters_of(linear: gtsam.GaussianFactorGraph, sensors: list[int]) -> list[t
     for index in range(linear.size()):
         rows = sorted({owner[key] for key in list(linear.at(index).keys()) if key in owner})
         pairs += [(rows[0], row) for row in rows[1:]]
-    at = np.array(pairs).T
-    count = len(sensors)
-    edges = coo_array((np.ones(at.shape[1]), (at[0], at[1])), shape=(count, count))
-    _, labels = connected_components(edges, directed=False)
-    named = np.array(sensors)
+    labels, named = parts_of(np.array(pairs), len(sensors)), np.array(sensors)
     return [tuple(named[labels == label].tolist()) for label in range(labels.max() + 1)]
 
 

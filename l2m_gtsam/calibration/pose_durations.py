@@ -209,8 +209,7 @@ def shared_errors(view: View, field_map: QueryableMap, near: Estimate) -> Shared
 
 def _drives(readings: Readings) -> Iterator[IntArray]:
     """Return the rows of each drive."""
-    of = np.zeros(len(readings), dtype=np.int64) if readings.drive is None else readings.drive
-    return (np.flatnonzero(of == each) for each in np.unique(of))
+    return (np.flatnonzero(readings.of_drive == each) for each in np.unique(readings.of_drive))
 
 
 def _width(readings: Readings) -> float:

@@ -334,12 +334,15 @@ def matching(pattern: str, sensors: tuple[str, ...], key: str) -> list[int]:
     """Return the sensors that a name or a pattern stands for; there is at least one."""
     found = [index for index, name in enumerate(sensors) if fnmatchcase(name, pattern)]
     if not found:
-        msg = (
-            f"calibration.priors.{key}: no sensor named {pattern!r}; the recording has "
-            f"{', '.join(sensors)}"
-        )
-        raise CalibrationError(msg)
+        raise _no_sensor(key, pattern, sensors)
     return found
+
+
+def _no_sensor(key: str, name: str, sensors: tuple[str, ...]) -> CalibrationError:
+    return CalibrationError(
+        f"calibration.priors.{key}: no sensor named {name!r}; the recording has "
+        f"{', '.join(sensors)}"
+    )
 
 
 def planar(plane: PlanarMount, sensors: tuple[str, ...]) -> list[Difference]:
@@ -377,9 +380,5 @@ def between(baseline: Baseline, sensors: tuple[str, ...]) -> Prior:
 def one(name: str, sensors: tuple[str, ...]) -> int:
     """Return the sensor of that very name."""
     if name not in sensors:
-        msg = (
-            f"calibration.priors.array.baselines: no sensor named {name!r}; the recording has "
-            f"{', '.join(sensors)}"
-        )
-        raise CalibrationError(msg)
+        raise _no_sensor("array.baselines", name, sensors)
     return sensors.index(name)

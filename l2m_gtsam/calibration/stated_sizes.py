@@ -147,11 +147,7 @@ def take_all_noise(noise: FloatArray) -> bool:
 
 
 def size_of_shared(
-    cause: ErrorCause,
-    joint: JointInformation,
-    at: IntArray,
-    prior: FloatArray,
-    weights: FloatArray,
+    cause: ErrorCause, joint: JointInformation, at: IntArray, prior: FloatArray, weights: FloatArray
 ) -> StatedSize:
     """Return how large errors that readings share are beside their prior.
 

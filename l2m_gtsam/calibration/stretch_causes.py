@@ -17,14 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive
-from l2m_gtsam.calibration.causes import REJECTED, passages_of, sensor_offsets
-from l2m_gtsam.calibration.changed_places import (
-    CELL_M,
-    ChangesOptions,
-    averaged_drive,
-    is_place_of,
-)
+from l2m_gtsam.calibration.changed_places import CELL_M, ChangesOptions, averaged_drive, is_place_of
 from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.drive_sources import REJECTED, passages_of, sensor_offsets
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray

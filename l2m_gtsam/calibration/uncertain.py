@@ -12,18 +12,16 @@ solve took 0.54 s of a processor so, 0.70 s with sensors last, 0.76 s and more w
 METIS was as fast, but GTSAM 4.3 can crash in it. QR is for graphs that Cholesky refuses.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
 from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, FoundProcess, Searched, search
 from l2m_gtsam.calibration.budget.unseen_warp import unseen_warp
-from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver, Optimised
@@ -36,16 +34,16 @@ from l2m_gtsam.calibration.stated_sizes import (
     shown_by_one,
 )
 from l2m_gtsam.calibration.uncertain_graph import (
+    IndependentOptimum,
     UncertainDrive,
     UncertainProblem,
     starting_values,
 )
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.uncertain_rounds import Beginning, Settled, settle_by_any
-from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap, View
+from l2m_gtsam.calibration.view import REOBSERVE_M
 from l2m_gtsam.parallel.threads import side_by_side
 from l2m_gtsam.records.error_budget import DisturbanceKind, StatedSize
-from l2m_gtsam.solve.rank import Determinacy
 
 SEARCHED = 0.6  # of the way, when it is known which processes a drive has
 
@@ -84,72 +82,52 @@ class UncertainSolution:
     by_parts: tuple[ByParts, ...] = ()
     unseen_warp_m: float | None = None
 
-    @property
-    def settled(self) -> bool:
-        """Whether another round would repeat the last."""
-        return not self.unsettled
-
 
 def solve_uncertain(
-    view: View,
-    field_map: QueryableMap,
-    errors: UncertainMap,
-    near: Estimate,
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
-    progress: Callable[[float], None],
+    near: IndependentOptimum, progress: Callable[[float], None]
 ) -> UncertainSolution:
     """Finish a calibration with the map's error as part of the graph.
 
     Parameters
     ----------
-    view
-        The readings used.
-    field_map, errors
-        The map, and what it knows of its errors.
     near
         The optimum with independent errors.
-    tests
-        Rank test of each sensor.
-    options
-        How to solve.
     progress
         Called with the fraction that is done.
     """
     progress(0.0)
-    drive = UncertainDrive.of(view, field_map, errors, near, options)
-    found = settle_by_any(drive, near, tests, options, lambda done: progress(SEARCHED * done))
+    drive, view = UncertainDrive.of(near), near.view
+    found = settle_by_any(drive, near.estimate, lambda done: progress(SEARCHED * done))
     # Processes would take up what is stated too small: it is judged without them.
-    stated = found.optimum.stated(options.sensor_noise_ut)
+    stated = found.optimum.stated(near.options.sensor_noise_ut)
     if short := noise_is_short(stated):
         # White readings would be several times what they should, and anything would explain them.
-        options = options.model_copy(update={"sensor_noise_ut": None})
-        near = replace(found.estimate, noise=found.optimum.noise())
-        found = settle_by_any(drive, near, tests, options, lambda _: None)
+        options = near.options.model_copy(update={"sensor_noise_ut": None})
+        noisier = replace(found.estimate, noise=found.optimum.noise())
+        near = replace(near, estimate=noisier, options=options)
+        found = settle_by_any(replace(drive, options=options), noisier, lambda _: None)
     searched = found.ending is not Ending.SINGULAR
     searched = searched and leave_noise(stated, found.estimate.noise[view.sensors])
     known = found.optimum.informed() if searched else None
     shown = search(known) if known else NOTHING_SEARCHED
     if shown.found:
-        moved = float(np.abs(found.estimate.t - near.t)[view.sensors].max())
-        start = start_with(found, shown, field_map, errors, options, again=moved > REOBSERVE_M)
+        moved = float(np.abs(found.estimate.t - near.estimate.t)[view.sensors].max())
+        start = start_with(found, shown, near, again=moved > REOBSERVE_M)
         found = settle_by_any(
             start.drive,
             start.estimate,
-            tests,
-            options,
             lambda done: progress(SEARCHED + (1 - SEARCHED) * done),
             start.begin,
         )
     if short:
-        left = found.estimate.noise / near.noise
+        left = found.estimate.noise / near.estimate.noise
         stated = beside_processes(stated, view.readings.sensors, left)
-    stated = of_its_sensor(stated, shown.found, view, field_map, errors, near, tests, options)
+    stated = of_its_sensor(stated, shown.found, near)
     optimum = found.optimum
     solved, size = optimum.by_cause(optimum.solutions()), None
-    if known is not None and options.warp_m > 0 and found.drive.budget.warp is None:
+    if known is not None and near.options.warp_m > 0 and found.drive.budget.warp is None:
         of_warp = optimum.informed_of_warp() if shown.found else known.of_kind(DisturbanceKind.WARP)
-        unseen = unseen_warp(of_warp, options.warp_m)
+        unseen = unseen_warp(of_warp, near.options.warp_m)
         solved, size = optimum.with_unseen(solved, unseen), unseen.size_m
     scattered, halved = side_by_side(optimum.scattered, lambda: optimum.halved(solved))
     solved = optimum.wandering(optimum.robust(halved, scattered))
@@ -165,20 +143,9 @@ def solve_uncertain(
     )
 
 
-def check_by_parts(
-    view: View,
-    field_map: QueryableMap,
-    errors: UncertainMap,
-    near: Estimate,
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
-) -> UncertainSolution:
-    """Return solutions without any process, with what the scatter of parts of the drive says.
-
-    Parameters are those of ``solve_uncertain``.
-    """
-    drive = UncertainDrive.of(view, field_map, errors, near, options)
-    found = settle_by_any(drive, near, tests, options, lambda _: None)
+def check_by_parts(near: IndependentOptimum) -> UncertainSolution:
+    """Return solutions without any process, with what the scatter of parts of the drive says."""
+    found = settle_by_any(UncertainDrive.of(near), near.estimate, lambda _: None)
     return UncertainSolution(
         found.estimate,
         found.optimum.solutions(),
@@ -189,14 +156,7 @@ def check_by_parts(
 
 
 def of_its_sensor(
-    stated: tuple[StatedSize, ...],
-    found: Sequence[FoundProcess],
-    view: View,
-    field_map: QueryableMap,
-    errors: UncertainMap,
-    near: Estimate,
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
+    stated: tuple[StatedSize, ...], found: Sequence[FoundProcess], near: IndependentOptimum
 ) -> tuple[StatedSize, ...]:
     """Return sizes where errors of poses are said of the sensor that alone shows them, if one does.
 
@@ -206,15 +166,15 @@ def of_its_sensor(
     ----------
     stated, found
         Sizes that all sensors show, and the processes.
-    view, field_map, errors, near, tests, options
+    near
         As of ``solve_uncertain``.
     """
-    suspect = moved_most(found)
+    suspect, view = moved_most(found), near.view
     if suspect is None or not poses_too_small(stated) or len(view.sensors) < 2:
         return stated
     others = [sensor for sensor in view.sensors if sensor != suspect]
     part = view.select(view.readings.sensor != suspect, others)
-    without = step_to_optimum(part, field_map, errors, near, tests, options).optimum
+    without = step_to_optimum(replace(near, view=part)).optimum
     return shown_by_one(stated, without.stated(None), view.readings.sensors[suspect])
 
 
@@ -245,13 +205,7 @@ class ProcessStart:
 
 
 def start_with(
-    found: Settled,
-    shown: Searched,
-    field_map: QueryableMap,
-    errors: UncertainMap,
-    options: OneKeyOptions,
-    *,
-    again: bool,
+    found: Settled, shown: Searched, near: IndependentOptimum, *, again: bool
 ) -> ProcessStart:
     """Return where the rounds begin with processes that a graph without them has shown.
 
@@ -261,13 +215,13 @@ def start_with(
         That graph at its optimum.
     shown
         The processes.
-    field_map, errors, options
-        As in ``solve_uncertain``.
+    near
+        As of ``solve_uncertain``.
     again
         Whether the map has to be asked again where sensors are.
     """
     budget, estimate = Budget(shown.found), found.estimate
-    if options.sensor_noise_ut is None:
+    if near.options.sensor_noise_ut is None:
         estimate = replace(estimate, noise=estimate.noise * np.sqrt(shown.noise))
     if budget.poses is None and not again:
         values = with_processes(found, budget, shown)
@@ -276,60 +230,42 @@ def start_with(
         likely = optimum.problem.at_likely_poses(optimum.values)
         begin = Beginning(values, near=True, readings=likely)
         return ProcessStart(found.drive.beside(budget), estimate, begin)
-    given = (found.drive.view, field_map, errors, estimate, options, budget)
-    return ProcessStart(UncertainDrive.of(*given), estimate, None)
+    drive = UncertainDrive.of(replace(near, estimate=estimate), budget)
+    return ProcessStart(drive, estimate, None)
 
 
 def with_processes(found: Settled, budget: Budget, shown: Searched) -> gtsam.Values:
     """Return where the optimum is with processes that are no errors of poses, to first order."""
-    delta = gtsam.VectorValues()
-    for key, at in found.optimum.joint.columns.items():
-        delta.insert(key, shown.moved[at])
-    values = found.optimum.values.retract(delta)
+    values = found.optimum.joint.stepped(found.optimum.values, shown.moved)
     # Each has a variable of its own.
     for key, weights in zip(budget.variables, shown.weights, strict=True):
         values.insert(key, weights)
     return values
 
 
-def step_uncertain(
-    view: View,
-    field_map: QueryableMap,
-    errors: UncertainMap,
-    near: Estimate,
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
-    budget: Budget = NOTHING_FOUND,
-) -> UncertainSolution:
+def step_uncertain(near: IndependentOptimum, budget: Budget = NOTHING_FOUND) -> UncertainSolution:
     """Return the same after a single Gauss-Newton step, with the weights at its start.
 
     From the optimum with independent errors that is exact but for products of C and shared errors.
-    Parameters are those of ``solve_uncertain``, and processes that are known beforehand.
+    The budget has processes that are known beforehand.
     """
-    step = step_to_optimum(view, field_map, errors, near, tests, options, budget)
+    step = step_to_optimum(near, budget)
     solved = step.optimum.solutions()
     return UncertainSolution(step.estimate, solved, step.ending, step.unsettled)
 
 
-def step_to_optimum(
-    view: View,
-    field_map: QueryableMap,
-    errors: UncertainMap,
-    near: Estimate,
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
-    budget: Budget = NOTHING_FOUND,
-) -> Settled:
+def step_to_optimum(near: IndependentOptimum, budget: Budget = NOTHING_FOUND) -> Settled:
     """Return where such a step ends. Parameters are those of ``step_uncertain``."""
-    places = ReadingPlaces.of(view.readings, field_map, near)
-    drive = UncertainDrive.of(view, field_map, errors, near, options, budget.at(places))
-    problem = UncertainProblem(drive, near, tests, options.factors)
-    step = step_by_any(problem, starting_values(near, view.sensors, drive.prior.coverage))
+    estimate, sensors = near.estimate, near.view.sensors
+    places = ReadingPlaces.of(near.view.readings, near.field_map, estimate)
+    drive = UncertainDrive.of(near, budget.at(places))
+    problem = UncertainProblem(drive, estimate)
+    step = step_by_any(problem, starting_values(estimate, sensors, drive.prior.coverage))
     if problem.noise.pose is not None:
         likely = problem.at_likely_poses(step.values)
-        problem = UncertainProblem(drive, near, tests, options.factors, readings=likely)
+        problem = UncertainProblem(drive, estimate, readings=likely)
         step = step_by_any(problem, step.values)
-    estimate = near.updated(step.values, view.sensors)
+    estimate = estimate.updated(step.values, sensors)
     optimum = UncertainOptimum.at(problem, step.values)
     return Settled(optimum, estimate, step.ending, frozenset())
 

@@ -3,18 +3,12 @@
 What all rounds have in common is an `UncertainDrive`; each has a graph at weights of its own.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from l2m_factors import (
-    U,
-    UncertainReadings,
-    uncertain_block_factor,
-    uncertain_reading_factor,
-)
+from l2m_factors import U, UncertainReadings, uncertain_block_factor, uncertain_reading_factor
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.coverage import POSE, Coverage, UncertainMap, cover, moving_fields
@@ -104,11 +98,47 @@ class WeightsPrior:
 
 
 @dataclass(frozen=True)
-class UncertainDrive:
-    """What all rounds have in common: readings, the map, and the errors that readings share."""
+class IndependentOptimum:
+    """What the last graph goes on from: the optimum with independent errors.
+
+    Attributes
+    ----------
+    view
+        The readings used.
+    field_map, errors
+        The map, and what it knows of its errors.
+    estimate
+        All sensors.
+    tests
+        Rank test of each sensor.
+    options
+        How to solve.
+    """
 
     view: View
     field_map: QueryableMap
+    errors: UncertainMap
+    estimate: Estimate
+    tests: dict[int, Determinacy]
+    options: OneKeyOptions
+
+
+@dataclass(frozen=True)
+class UncertainDrive:
+    """What all rounds have in common: readings, the map, and the errors that readings share.
+
+    Attributes
+    ----------
+    view, field_map, tests, options
+        As of ``IndependentOptimum``.
+    prior
+        Of the errors that readings share.
+    """
+
+    view: View
+    field_map: QueryableMap
+    tests: dict[int, Determinacy]
+    options: OneKeyOptions
     prior: WeightsPrior
 
     @property
@@ -117,21 +147,14 @@ class UncertainDrive:
         return self.prior.coverage.budget
 
     @classmethod
-    def of(
-        cls,
-        view: View,
-        field_map: QueryableMap,
-        errors: UncertainMap,
-        near: Estimate,
-        options: OneKeyOptions,
-        budget: Budget = NOTHING_FOUND,
-    ) -> "UncertainDrive":
+    def of(cls, near: IndependentOptimum, budget: Budget = NOTHING_FOUND) -> "UncertainDrive":
         """Return what readings share where an estimate puts them."""
-        view = replace(view, readings=budget.on(view.readings))
-        coverage = cover(view, errors, near, budget.lasting(options.pose_noise.lasting_s))
+        options, view = near.options, replace(near.view, readings=budget.on(near.view.readings))
+        lasting_s = budget.lasting(options.pose_noise.lasting_s)
+        coverage = cover(view, near.errors, near.estimate, lasting_s)
         moving = moving_fields(view.readings, options.moving_field_ut)
         coverage = replace(coverage, moving=moving, budget=budget)
-        return cls(view, field_map, WeightsPrior.of(coverage))
+        return cls(view, near.field_map, near.tests, options, WeightsPrior.of(coverage))
 
     def beside(self, budget: Budget) -> "UncertainDrive":
         """Return the same with processes that are no errors of poses, and the map as it was asked.
@@ -170,10 +193,6 @@ class UncertainProblem:
         Readings and what they share.
     estimate
         Where the weights are taken.
-    tests
-        Rank test of each sensor.
-    factors
-        One factor for a group of readings or one for each; the mathematics is the same.
     held_at
         Where directions are held that nothing determines; at the estimate if that is not given.
     readings
@@ -181,7 +200,7 @@ class UncertainProblem:
 
     Attributes
     ----------
-    drive, estimate, tests
+    drive, estimate
         As given.
     batch
         The readings as factors have them.
@@ -197,14 +216,12 @@ class UncertainProblem:
         self,
         drive: UncertainDrive,
         estimate: Estimate,
-        tests: Mapping[int, Determinacy],
-        factors: FactorForm,
         held_at: Estimate | None = None,
         readings: Readings | None = None,
     ) -> None:
         view, field_map, coverage = drive.view, drive.field_map, drive.prior.coverage
         view = view if readings is None else replace(view, readings=readings)
-        self.drive, self.estimate, self.tests = drive, estimate, tests
+        self.drive, self.estimate = drive, estimate
         self.batch = batch_readings(view.readings, field_map)
         self.noise = group_noise(view, field_map, coverage, estimate)
         self.groups = [
@@ -213,25 +230,21 @@ class UncertainProblem:
                 coverage.groups, self.noise.errors, self.noise.whitenings, strict=True
             )
         ]
-        own = {s: tests[s] for s in view.sensors}
+        own = {s: drive.tests[s] for s in view.sensors}
         self._sensor_priors = prior_graph(estimate if held_at is None else held_at, own)
         self.graph = gtsam.NonlinearFactorGraph()
         for group in self.groups:
-            self.graph.push_back(_factors(group, factors))
+            self.graph.push_back(_factors(group, drive.options.factors))
         self.graph.push_back(drive.prior.graph)
         self.graph.push_back(self._sensor_priors)
 
-    def arrive(
-        self, values: gtsam.Values, options: OneKeyOptions, solver: LinearSolver, *, near: bool
-    ) -> Arrival:
+    def arrive(self, values: gtsam.Values, solver: LinearSolver, *, near: bool) -> Arrival:
         """Go to the optimum, with the last step from the information of all variables.
 
         Parameters
         ----------
         values
             Where to start.
-        options
-            How to descend.
         solver
             Of the linear systems.
         near
@@ -246,7 +259,7 @@ class UncertainProblem:
             if self.graph.error(came) > most_after_step(self.graph.error(values)):
                 came = values
         else:
-            descent = self.descend(values, options, solver, NEARLY)
+            descent = self.descend(values, solver, NEARLY)
             came, ending = descent.values, descent.ending
         joint = self.linearised(came)
         short = joint.furthest(self.drive.view.sensors) < NEAR_SIGMAS
@@ -254,7 +267,7 @@ class UncertainProblem:
             return Arrival(joint.stepped(came) if short else came, joint, ending)
         # Readings that cross from block to block of a map make steps in the error, which stop
         # a descent; the gradient does not see them.
-        descent = self.descend(came, options, solver)
+        descent = self.descend(came, solver)
         last = self.polish(descent.values, POLISHING_STEPS, solver)
         ending = last.ending if last.ending is Ending.SINGULAR else descent.ending
         joint = self.linearised(last.values)
@@ -262,14 +275,10 @@ class UncertainProblem:
         return Arrival(joint.stepped(last.values) if close else last.values, joint, ending)
 
     def descend(
-        self,
-        values: gtsam.Values,
-        options: OneKeyOptions,
-        solver: LinearSolver,
-        tolerance: float = TOLERANCE,
+        self, values: gtsam.Values, solver: LinearSolver, tolerance: float = TOLERANCE
     ) -> Optimised:
         """Minimise the cost."""
-        optimizer, most = options.optimizer, options.joint_iterations
+        optimizer, most = self.drive.options.optimizer, self.drive.options.joint_iterations
         return optimise(self.graph, values, optimizer, most, solver, tolerance)
 
     def polish(self, values: gtsam.Values, steps: int, solver: LinearSolver) -> Optimised:

@@ -9,10 +9,9 @@ import numpy as np
 
 from l2m_factors import D, Q, U, W
 from l2m_gtsam.calibration.budget.found import spread_of_H
-from l2m_gtsam.calibration.budget.looked_for import processes
+from l2m_gtsam.calibration.budget.looked_for import LAGGING_S, processes
 from l2m_gtsam.calibration.budget.processes import Process, ReadingPlaces, Warp
 from l2m_gtsam.calibration.budget.search import ProcessInformation, process_information
-from l2m_gtsam.calibration.budget.smoothing import LAGGING_S
 from l2m_gtsam.calibration.budget.unseen_warp import UnseenWarp
 from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.coverage import Correction, Coverage
@@ -36,7 +35,7 @@ from l2m_gtsam.calibration.stated_sizes import (
     size_of_shared,
 )
 from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
-from l2m_gtsam.calibration.variance_parts import PriorRows, variance_parts
+from l2m_gtsam.calibration.variance_parts import variance_parts
 from l2m_gtsam.calibration.view import View
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import ErrorCause, StatedSize
@@ -79,7 +78,7 @@ class UncertainOptimum:
 
     def solutions(self) -> tuple[SensorSolution, ...]:
         """Return covariance and figures of every sensor."""
-        joint, problem, tests = self.joint, self.problem, self.problem.tests
+        joint, problem, tests = self.joint, self.problem, self.problem.drive.tests
         sensors = tuple(self._view.sensors)
         system = joint_covariance(
             problem.graph.linearize(self.values), self.values, joint.of_system
@@ -182,9 +181,8 @@ class UncertainOptimum:
 
     def by_cause(self, solved: Sequence[SensorSolution]) -> tuple[SensorSolution, ...]:
         """Return solutions with what each cause has of their variances."""
-        prior = PriorRows.of(self._coverage.columns, self.problem.drive.prior.information)
-        sensors = [each.sensor for each in solved]
-        parts = variance_parts(self.joint, prior, self.problem.noise, sensors)
+        problem, sensors = self.problem, [each.sensor for each in solved]
+        parts = variance_parts(self.joint, problem.drive.prior, problem.noise, sensors)
         pairs = zip(solved, parts, strict=True)
         return tuple(replace(each, variances=own) for each, own in pairs)
 
@@ -249,7 +247,7 @@ class UncertainOptimum:
 
     def _taken(self, sensor: int) -> float:
         """Return the degrees of freedom that the fit took of a sensor's readings."""
-        return self.problem.tests[sensor].free + self.joint.taken(sensor)
+        return self.problem.drive.tests[sensor].free + self.joint.taken(sensor)
 
     def _correction(self, sensor: int) -> Correction | None:
         """Return what recorded numbers still add to a sensor's readings; none if none act on it."""

@@ -3,13 +3,12 @@
 What makes readings white follows C and the noise of the sensors, which the graph determines.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver
@@ -80,8 +79,6 @@ class Settled:
 def settle_by_any(
     drive: UncertainDrive,
     near: Estimate,
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
     progress: Callable[[float], None],
     begin: Beginning | None = None,
 ) -> Settled:
@@ -90,7 +87,7 @@ def settle_by_any(
         zero = starting_values(near, drive.view.sensors, drive.prior.coverage)
         begin = Beginning(zero, near=False)
     for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):
-        found = settle(drive, near, begin, tests, options, solver, progress)
+        found = settle(drive, near, begin, solver, progress)
         if found.ending is not Ending.SINGULAR:
             break
     return found
@@ -100,8 +97,6 @@ def settle(
     drive: UncertainDrive,
     estimate: Estimate,
     begin: Beginning,
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
     solver: LinearSolver,
     progress: Callable[[float], None],
 ) -> Settled:
@@ -113,24 +108,20 @@ def settle(
         Readings and what they share.
     estimate, begin
         Where to start.
-    tests
-        Rank test of each sensor.
-    options
-        How to solve.
     solver
         Of the linear systems.
     progress
         Called with the fraction that is done.
     """
-    sensors = drive.view.sensors
+    sensors, options = drive.view.sensors, drive.options
     unsettled = frozenset(sensors)
     values, near, readings = begin.values, begin.near, begin.readings
     ending, begun = Ending.TOLERANCE, estimate
-    open_ = [s for s in sensors if tests[s].place_open]
+    open_ = [s for s in sensors if drive.tests[s].place_open]
     for round_ in range(most := ROUNDS_OF_OPEN if open_ else MAX_ROUNDS):
         held_at = estimate.as_in(begun, open_)  # else they slide on with each round
-        problem = UncertainProblem(drive, estimate, tests, options.factors, held_at, readings)
-        arrived = problem.arrive(values, options, solver, near=near)
+        problem = UncertainProblem(drive, estimate, held_at, readings)
+        arrived = problem.arrive(values, solver, near=near)
         values, joint = arrived.values, arrived.joint
         optimum = UncertainOptimum(problem, values, joint)
         if arrived.ending is Ending.SINGULAR:
@@ -178,7 +169,7 @@ def still_changing(
     changing = frozenset(
         s
         for s in sensors
-        if joint.sigmas(s, determined_rows(problem.tests[s], options)) >= SETTLED_SIGMAS
+        if joint.sigmas(s, determined_rows(problem.drive.tests[s], options)) >= SETTLED_SIGMAS
         or not problem.same_noise(after, before, s)
     )
     return changing or frozenset(sensors if joint.decrement >= THERE_SIGMAS else ())

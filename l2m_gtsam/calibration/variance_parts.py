@@ -10,7 +10,6 @@ so that each cause has the sum over its own rows: an estimate errs by P a times 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -18,6 +17,7 @@ import numpy as np
 from l2m_gtsam.calibration.group_noise import GroupNoise
 from l2m_gtsam.calibration.joint_information import JointInformation, columns_at
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
+from l2m_gtsam.calibration.uncertain_graph import WeightsPrior
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import ErrorCause, VarianceShare
 
@@ -38,34 +38,16 @@ LEAST = 1e-3  # of a variance: less is not listed
 Parts = dict[ErrorCause, FloatArray]
 
 
-@dataclass(frozen=True)
-class PriorRows:
-    """Rows of the priors of shared errors, by cause.
-
-    Attributes
-    ----------
-    columns
-        Where the errors of each cause stand among all variables, shape (k,).
-    information
-        Of all K shared errors before any reading, shape (K, K); they come first, and causes are
-        independent of each other.
-    """
-
-    columns: Mapping[ErrorCause, IntArray]
-    information: FloatArray
-
-    @classmethod
-    def of(cls, columns: Mapping[int, slice], information: FloatArray) -> "PriorRows":
-        """Return the rows of shared errors, by key and where they stand."""
-        named: dict[ErrorCause, list[int]] = {}
-        for key in columns:
-            named.setdefault(BY_SYMBOL[chr(gtsam.symbolChr(key))], []).append(key)
-        found = {cause: columns_at(columns, keys) for cause, keys in named.items()}
-        return cls(found, information)
+def by_cause(columns: Mapping[int, slice]) -> dict[ErrorCause, IntArray]:
+    """Return where the errors of each cause stand, (k,), from where those of each key do."""
+    named: dict[ErrorCause, list[int]] = {}
+    for key in columns:
+        named.setdefault(BY_SYMBOL[chr(gtsam.symbolChr(key))], []).append(key)
+    return {cause: columns_at(columns, keys) for cause, keys in named.items()}
 
 
 def variance_parts(
-    joint: JointInformation, prior: PriorRows, noise: GroupNoise, sensors: Sequence[int]
+    joint: JointInformation, prior: WeightsPrior, noise: GroupNoise, sensors: Sequence[int]
 ) -> tuple[Parts, ...]:
     """Return what each cause has of the variances of each sensor, by cause: t, C, H, shape (3,).
 
@@ -74,7 +56,7 @@ def variance_parts(
     joint
         All variables, at the optimum.
     prior
-        Rows of the shared errors' priors.
+        Of the shared errors, which come first; causes are independent of each other.
     noise
         What readings have of noise, map and poses each.
     sensors
@@ -89,7 +71,7 @@ def variance_parts(
     def add(cause: ErrorCause, values: FloatArray) -> None:
         variances[cause] = variances.get(cause, np.zeros(len(own))) + values
 
-    for cause, at in prior.columns.items():
+    for cause, at in by_cause(prior.coverage.columns).items():
         X = influence[at]
         add(cause, np.einsum("ki,ki->i", X, prior.information[np.ix_(at, at)] @ X))
     of_map, of_poses = noise.shares

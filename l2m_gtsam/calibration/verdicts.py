@@ -275,20 +275,18 @@ def _verdict(
 def _unsolved(
     name: str, usable: int, counts: SyncCounts, outside: int, moved: Movement, needed: int
 ) -> SensorCalibration:
-    status, message = (
-        SensorStatus.OUTSIDE_MAP,
-        (f"{outside} of {usable} readings lie outside the map, at least {needed} must lie inside"),
-    )
+    status, inside = SensorStatus.NO_READINGS, usable - outside
     if usable < needed:
-        status, message = SensorStatus.NO_READINGS, _why_silent(usable, counts, moved, needed)
-    elif usable - outside >= needed:
-        status, message = (
-            SensorStatus.NO_READINGS,
-            (
-                f"none of its {usable - outside} readings inside the map fits any distortion: is "
-                "the sensor saturated, and is it the right map with poses in its frame?"
-            ),
+        message = _why_silent(usable, counts, moved, needed)
+    elif inside >= needed:
+        message = (
+            f"none of its {inside} readings inside the map fits any distortion: is "
+            "the sensor saturated, and is it the right map with poses in its frame?"
         )
+    else:
+        status = SensorStatus.OUTSIDE_MAP
+        message = f"{outside} of {usable} readings lie outside the map, "
+        message += f"at least {needed} must lie inside"
     rotation = _no_rotation()
     return SensorCalibration(
         sensor=name,

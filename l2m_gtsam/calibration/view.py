@@ -10,13 +10,13 @@ count: ``RememberedMap`` is asked for no place twice, and remembers the last ans
 import math
 from dataclasses import dataclass, replace
 from threading import Lock, local
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, Readings
-from l2m_gtsam.maps.field_map import optional_members
+from l2m_gtsam.maps.field_map import WrappedMap
 
 # The map's errors change over decimetres: it is not asked for them again while all readings are as
 # near to where it was, metres.
@@ -238,7 +238,7 @@ class LastFields:
 NOTHING = LastFields(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
 
 
-class RememberedMap:
+class RememberedMap(WrappedMap):
     """A map with a memory of the places that it was asked for; in all else the map itself.
 
     Parameters
@@ -248,18 +248,12 @@ class RememberedMap:
     """
 
     def __init__(self, field_map: QueryableMap) -> None:
-        self._map = field_map
+        super().__init__(field_map)
         self._lock = Lock()
         self._rows: dict[bytes, int] = {}
         self._values = np.empty((0, VALUES))
         self._inside = np.empty(0, dtype=np.bool_)
-        vars(self).update(optional_members(field_map, self))
         self._own = local()  # what a thread asked last is no use to another, which would forget it
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "_map":  # before there is one, as when another process unpacks it
-            raise AttributeError(name)
-        return getattr(self._map, name)
 
     def __reduce__(self) -> tuple[type["RememberedMap"], tuple[QueryableMap]]:
         return RememberedMap, (self._map,)
@@ -282,7 +276,7 @@ class RememberedMap:
         """Return field, gradient, variance and whether the map has data there."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         with self._lock:
-            sample = self._recalled(points)
+            sample = self._recalled(points, _names(points))
         inside = sample.inside
         self._own.last = LastFields(points[inside], sample.field[inside], sample.gradient[inside])
         return sample
@@ -293,17 +287,16 @@ class RememberedMap:
             self._make_room(len(points))
             self._keep(_names(np.ascontiguousarray(points, dtype=np.float64)), sample)
 
-    def _recalled(self, points: FloatArray) -> FieldSample:
-        names = _names(points)
+    def _recalled(self, points: FloatArray, names: list[bytes]) -> FieldSample:
         self._make_room(len(points))
         fresh = np.array([name not in self._rows for name in names], dtype=np.bool_)
         if fresh.any():
-            self._learn(points[fresh], [names[row] for row in np.flatnonzero(fresh)])
+            new = [names[row] for row in np.flatnonzero(fresh)]
+            self._keep(new, self._map.query(points[fresh]))
         at = np.array([self._rows[name] for name in names], dtype=np.int64)
-        return self._sample(at)
-
-    def _learn(self, points: FloatArray, names: list[bytes]) -> None:
-        self._keep(names, self._map.query(points))
+        values = self._values[at]
+        gradient = values[:, 3:12].reshape(-1, 3, 3)
+        return FieldSample(values[:, :3], gradient, values[:, 12:], self._inside[at])
 
     def _keep(self, names: list[bytes], sample: FieldSample) -> None:
         parts = (sample.field, sample.gradient.reshape(-1, 9), sample.variance)
@@ -315,11 +308,6 @@ class RememberedMap:
     def _make_room(self, count: int) -> None:
         if len(self._rows) + count > MOST:
             self._rows, self._values, self._inside = {}, self._values[:0], self._inside[:0]
-
-    def _sample(self, at: IntArray) -> FieldSample:
-        values = self._values[at]
-        gradient = values[:, 3:12].reshape(-1, 3, 3)
-        return FieldSample(values[:, :3], gradient, values[:, 12:], self._inside[at])
 
 
 def _names(points: FloatArray) -> list[bytes]:

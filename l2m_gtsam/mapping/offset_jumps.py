@@ -192,11 +192,6 @@ class Moments:
         return max(tried, key=lambda each: each.gain, default=None)
 
 
-def best_jump(seen: SeenWindows, sensors: IntArray, stamps: IntArray) -> TriedJump | None:
-    """Return the jump of some sensors before one of a few stamps that explains most."""
-    return Moments.of(seen, sensors, stamps).best(sensors)
-
-
 def closer_jump(seen: SeenWindows, found: TriedJump, stamps: IntArray) -> TriedJump:
     """Return a jump that was tried at few of ascending stamps at the best of all."""
     while True:
@@ -206,7 +201,7 @@ def closer_jump(seen: SeenWindows, found: TriedJump, stamps: IntArray) -> TriedJ
         place = int(np.searchsorted(few, np.searchsorted(stamps, found.between[1])))
         first, last = few[max(place - 1, 0)], few[min(place + 1, len(few) - 1)]
         inner = stamps[first - 1 : last + 1]
-        found = best_jump(seen, found.sensors, inner) or found
+        found = Moments.of(seen, found.sensors, inner).best(found.sensors) or found
         if len(some(len(inner))) == len(inner) - 1:
             return found
         stamps = inner
@@ -379,7 +374,7 @@ def closely(
         return found
     stamps = stamps_of(seen, found.sensors)
     stamps = stamps[(stamps >= low) & (stamps <= high)]
-    best = best_jump(seen, found.sensors, stamps)
+    best = Moments.of(seen, found.sensors, stamps).best(found.sensors)
     if best is None:
         return found
     return replace(found, between=closer_jump(seen, best, stamps).between)

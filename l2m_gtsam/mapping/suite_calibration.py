@@ -131,14 +131,12 @@ def suite_doubts(
         return ()
     if step.explained < NOTICED:
         return ()
-    return (
-        (
-            "the survey's sensors look uncalibrated: a first step towards other values explains "
-            f"{step.explained:.0%} of what the map takes for noise (largest change: "
-            f"{_largest(step)}); calibrate them with `l2m map suite`, then build the map with "
-            "--suite"
-        ),
+    doubt = (
+        "the survey's sensors look uncalibrated: a first step towards other values explains "
+        f"{step.explained:.0%} of what the map takes for noise (largest change: "
+        f"{_largest(step)}); calibrate them with `l2m map suite`, then build the map with --suite"
     )
+    return (doubt,)
 
 
 def _largest(step: SuiteStep) -> str:

@@ -130,12 +130,10 @@ def suite_likelihood(
 
 def likelihood_at(window: SuiteWindow, at: "WindowSlopes", sensors: FloatArray) -> SuiteLikelihood:
     """Return the same from slopes for these sensors that are known already."""
-    readings, basis, noise = window.readings, window.basis, at.noise
-    complexity = _complexity_slopes(basis, at.points, at.scale, at.field, noise)
     r, J = at.residual, at.slopes
-    slope = -np.einsum("ni,nij->j", r, J) / noise**2
-    slope -= np.einsum("ni,nij->j", complexity, at.places)
-    turned, volume = _volume_change(readings, sensors)
+    slope = -np.einsum("ni,nij->j", r, J) / at.noise**2
+    slope -= np.einsum("ni,nij->j", at.complexity(), at.places)
+    turned, volume = _volume_change(window.readings, sensors)
     value = at.field.value - volume
     return SuiteLikelihood(value, slope - turned, at.information(J), (r,))
 
@@ -177,7 +175,33 @@ class WindowSlopes:
 
     def information(self, columns: FloatArray) -> FloatArray:
         """Return ``A^T (sigma^2 I + F S F^T)^-1 A`` for A in uT, shape (N, 3, k): (k, k)."""
-        return _information(self.basis, self.points, self.scale, self.field, columns, self.noise)
+        D, k = self.scale, columns.shape[2]
+        own, shared = np.zeros((k, k)), np.zeros((len(D), k))
+        for at in batches(len(self.points)):
+            flat = columns[at].reshape(-1, k)
+            own += flat.T @ flat
+            shared += self.basis.features(self.points[at]).reshape(-1, len(D)).T @ flat
+        known = solve_triangular(self.field.factor, D[:, None] * shared / self.noise, lower=True)
+        return np.asarray((own - known.T @ known) / self.noise**2)
+
+    def complexity(self) -> FloatArray:
+        """Return derivatives of half the log determinant by the readings' places, shape (N, 3).
+
+        ``d log det(sigma^2 I + F S F^T) / 2 = tr(Sigma F^T dF) / sigma^2`` with the weights'
+        posterior covariance Sigma.
+        """
+        features, points, K, D = self.basis.features, self.points, self.field.factor, self.scale
+        slopes = np.empty_like(points)
+        for at in batches(len(points)):
+            F = features(points[at])
+            n, _, m = F.shape
+            half = solve_triangular(K, (F.reshape(-1, m) * D).T, lower=True)
+            spread = (solve_triangular(K, half, trans=1, lower=True).T * D).reshape(n, 3, m)
+            for axis, step in enumerate(STEP_M * np.eye(3)):
+                dF = features(points[at] + step) - features(points[at] - step)
+                change = np.einsum("nim,nim->n", spread, dF)
+                slopes[at, axis] = change / (2 * STEP_M * self.noise**2)
+        return slopes
 
     def beside_field(self, values: FloatArray) -> FloatArray:
         """Return what no field explains of values in uT, shape (N, 3)."""
@@ -275,37 +299,3 @@ def field_slopes(readings: Readings, turned: FloatArray, b: FloatArray) -> Float
         w = readings.motion.twist_lidar[:, :3]
         J[:, :, TAU] = np.einsum("nij,nj->ni", readings.R_map_lidar, np.cross(w, b))
     return J
-
-
-def _complexity_slopes(
-    basis: Basis, points: FloatArray, D: FloatArray, found: Evidence, noise: float
-) -> FloatArray:
-    """Return derivatives of half the log determinant by the readings' places, shape (N, 3).
-
-    ``d log det(sigma^2 I + F S F^T) / 2 = tr(Sigma F^T dF) / sigma^2`` with the weights'
-    posterior covariance Sigma.
-    """
-    slopes = np.empty_like(points)
-    for at in batches(len(points)):
-        F = basis.features(points[at])
-        n, _, m = F.shape
-        half = solve_triangular(found.factor, (F.reshape(-1, m) * D).T, lower=True)
-        spread = solve_triangular(found.factor, half, trans=1, lower=True).T * D
-        spread = spread.reshape(n, 3, m)
-        for axis, step in enumerate(STEP_M * np.eye(3)):
-            dF = basis.features(points[at] + step) - basis.features(points[at] - step)
-            slopes[at, axis] = np.einsum("nim,nim->n", spread, dF) / (2 * STEP_M * noise**2)
-    return slopes
-
-
-def _information(
-    basis: Basis, points: FloatArray, D: FloatArray, found: Evidence, J: FloatArray, noise: float
-) -> FloatArray:
-    """Return ``J^T (sigma^2 I + F S F^T)^-1 J``, shape (16 S, 16 S)."""
-    own, shared = np.zeros((J.shape[2],) * 2), np.zeros((len(D), J.shape[2]))
-    for at in batches(len(points)):
-        flat = J[at].reshape(-1, J.shape[2])
-        own += flat.T @ flat
-        shared += basis.features(points[at]).reshape(-1, len(D)).T @ flat
-    known = solve_triangular(found.factor, D[:, None] * shared / noise, lower=True)
-    return np.asarray((own - known.T @ known) / noise**2)

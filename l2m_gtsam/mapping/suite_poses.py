@@ -23,10 +23,17 @@ from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.mapping.shifts import survey_poses
 from l2m_gtsam.mapping.suite_likelihood import WindowSlopes, window_slopes
 from l2m_gtsam.mapping.suite_solver import SuiteRound, likeness
-from l2m_gtsam.maps.harmonic.pose_sizes import PARTS, FoundPoses, PoseView, most_likely
+from l2m_gtsam.maps.harmonic.pose_sizes import (
+    PARTS,
+    FoundPoses,
+    PoseView,
+    gain_as_stated,
+    most_likely,
+    noise_beside,
+)
 from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
-from l2m_gtsam.solve.variance_components import WeightSystem, noise_left
+from l2m_gtsam.solve.variance_components import WeightSystem
 
 
 @dataclass(frozen=True)
@@ -135,7 +142,7 @@ def with_pose_errors(
     if known[0].stated:
         seen = survey.seen(None, known[0].lasting_s)
         # Errors that every pose has of its own are noise of each reading, which is learnt.
-        lasting = known[0].duration_stated or gain_as_stated(seen) > 0
+        lasting = known[0].duration_stated or gain_as_stated([each.view for each in seen]) > 0
         return PosedRound(widened(survey, seen) if lasting else last)
     found = most_likely(survey.views, last.windows.prior.noise)
     if found is None:
@@ -143,19 +150,12 @@ def with_pose_errors(
     return PosedRound(widened(survey, survey.seen(found.sizes, found.lasting_s)), found)
 
 
-def gain_as_stated(seen: Sequence[PosesInWindow]) -> float:
-    """Return the logarithm of likelihood beyond that of exact poses."""
-    return sum(each.view.system.posterior(np.ones(len(each.view.part))).likelihood for each in seen)
-
-
 def widened(survey: PosedSurvey, seen: Sequence[PosesInWindow]) -> SuiteRound:
     """Return the round with a covariance that holds errors whose size is their unit."""
-    last, left = survey.last, []
-    unit = [np.ones(len(each.view.part)) for each in seen]
-    systems = [each.view.system for each in seen]
-    noise = noise_left(systems, unit, sum(each.view.squares for each in seen))
-    for slopes, each, one in zip(survey.slopes, seen, unit, strict=True):
-        likeliest = each.view.system.whiter(noise).posterior(one).rest
+    last, left, noise = survey.last, [], noise_beside([each.view for each in seen])
+    for slopes, each in zip(survey.slopes, seen, strict=True):
+        unit = np.ones(len(each.view.part))
+        likeliest = each.view.system.whiter(noise).posterior(unit).rest
         left.append(slopes.residual - slopes.beside_field(each.effects @ likeliest))
     # What is alike beyond that, as of waves that are left out.
     alike = noise * likeness(last.windows, left)

@@ -274,12 +274,8 @@ class SuiteProblem:
         total = reduce(add, self._window_scores(windows, sensors))
         off = (sensors - self._assumed).ravel()
         pull = self._information @ off
-        return SuiteLikelihood(
-            total.value - 0.5 * float(off @ pull),
-            total.slope - pull,
-            total.information,
-            total.residuals,
-        )
+        value = total.value - 0.5 * float(off @ pull)
+        return replace(total, value=value, slope=total.slope - pull)
 
 
 def likeness(windows: SuiteWindows, residuals: Sequence[FloatArray]) -> float:

@@ -53,45 +53,27 @@ class MapKind:
     Attributes
     ----------
     fit
-        From positions and readings in the map frame, (N, 3) each, in metres and microtesla, the
-        LiDAR's structure cloud, in metres, (M, 3), if there is one and the kind uses it, and what
-        errors of the sensors do to the readings, which only a kind that knows its own errors uses.
+        From positions and readings in the map frame, (N, 3) each, in metres and microtesla, and
+        options of the kind; where it uses them as well from the LiDAR's structure cloud, in metres,
+        (M, 3), and what errors of sensors and poses do to the readings, each if there is one.
     load
         From a stored state.
     uses_structure
-        Whether the kind has a use for a structure cloud.
+        Whether the kind has a use for a structure cloud, and for such errors.
     """
 
-    fit: Callable[
-        [
-            FloatArray,
-            FloatArray,
-            MapOptions,
-            FloatArray | None,
-            SuiteErrors | None,
-            SurveyPoses | None,
-        ],
-        FieldMap,
-    ]
+    fit: Callable[..., FieldMap]
     load: Callable[[MapState], FieldMap]
     uses_structure: bool = False
 
 
 KINDS = {
-    "harmonic": MapKind(
-        lambda p, b, o, *survey: HarmonicMap.fit(p, b, o.harmonic, *survey),
-        HarmonicMap.from_state,
-        uses_structure=True,
-    ),
-    "sliding_gp": MapKind(
-        lambda p, b, o, *_: SlidingGP.fit(p, b, o.sliding_gp), SlidingGP.from_state
-    ),
-    "bilinear": MapKind(
-        lambda p, b, o, *_: BilinearMap.fit(p, b, o.bilinear), BilinearMap.from_state
-    ),
-    "dense_gp": MapKind(lambda p, b, o, *_: DenseGP.fit(p, b, o.dense_gp), DenseGP.from_state),
+    "harmonic": MapKind(HarmonicMap.fit, HarmonicMap.from_state, uses_structure=True),
+    "sliding_gp": MapKind(SlidingGP.fit, SlidingGP.from_state),
+    "bilinear": MapKind(BilinearMap.fit, BilinearMap.from_state),
+    "dense_gp": MapKind(DenseGP.fit, DenseGP.from_state),
 }
-"""Every kind of map. A new kind is its own file, its line here and its options above."""
+"""Every kind of map. A new kind is its own file, its line here, its options above by its name."""
 
 
 def refuse_structure(*kinds: str) -> None:
@@ -138,7 +120,9 @@ def build_map(
     options = MapOptions() if options is None else options
     if cloud is not None:
         refuse_structure(options.kind)
-    return KINDS[options.kind].fit(points, field, options, cloud, suite, poses)
+    kind, own = KINDS[options.kind], getattr(options, options.kind)
+    survey = (cloud, suite, poses) if kind.uses_structure else ()
+    return kind.fit(points, field, own, *survey)
 
 
 def map_from_state(state: MapState) -> FieldMap:

@@ -17,7 +17,7 @@ rmse is of those inside of all maps.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -174,10 +174,7 @@ class Prediction:
 
 
 def compare_maps(
-    points: FloatArray,
-    field: FloatArray,
-    options: CompareOptions,
-    build: Build,
+    points: FloatArray, field: FloatArray, options: CompareOptions, build: Build
 ) -> MapComparison:
     """Compare kinds of maps on held-out patches of the readings.
 
@@ -240,21 +237,13 @@ def predicted(
     L2MError
         If a map cannot be built, or none has an answer.
     """
-    N = len(readings)
-    whole = Prediction(
-        np.empty((N, 3)), np.empty((N, 3)), np.empty(N, dtype=np.bool_), np.empty(0), np.empty(0)
-    )
-    noise, seconds = [], []
-    for fold in folds:
-        part = predicted_fold(readings, fold, kind, build)
-        whole.error[fold.held_out] = part.error
-        whole.variance[fold.held_out] = part.variance
-        whole.inside[fold.held_out] = part.inside
-        noise.append(part.noise)
-        seconds.append(part.seconds)
-    if not whole.inside.any():
+    parts = [vars(predicted_fold(readings, fold, kind, build)) for fold in folds]
+    every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if not every["inside"].any():
         raise MapError("no held-out reading lies inside the map; smaller patches are needed")
-    return replace(whole, noise=np.concatenate(noise), seconds=np.concatenate(seconds))
+    order = np.argsort(np.concatenate([fold.held_out for fold in folds]))
+    of_readings = {name: every[name][order] for name in ("error", "variance", "inside")}
+    return Prediction(**every | of_readings)
 
 
 def predicted_fold(readings: TrainingSet, fold: Fold, kind: str, build: Build) -> Prediction:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 from scipy.spatial.distance import cdist
 
-from l2m_gtsam.data import FieldSample, FloatArray
+from l2m_gtsam.data import FieldAndGradient, FieldSample, FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import masked
 from l2m_gtsam.maps.hyperparameters import not_definite
@@ -79,7 +79,7 @@ class DenseGP(GPMap[DenseGPOptions]):
         inside = np.concatenate([np.empty(0), *nearest]) <= reach
         return masked(FieldSample(field, gradient, self.variance(points), inside))
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
         y = self.trained.readings.points

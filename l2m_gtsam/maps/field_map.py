@@ -5,7 +5,7 @@ from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 
-from l2m_gtsam.data import ARRAYS, FieldSample, FloatArray, MapState, Recording
+from l2m_gtsam.data import ARRAYS, FieldAndGradient, FieldSample, FloatArray, MapState, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.records.map_diary import MapDiary
@@ -57,14 +57,28 @@ OPTIONAL = (
 )
 
 
-def optional_members(field_map: object, wrapper: object) -> dict[str, Any]:
-    """Return what a map has that a wrapper of it has not, of what only some maps have.
+class WrappedMap:
+    """A map with something beside it; in all that a derived class has not, the map itself.
 
     ``isinstance`` with a protocol looks for members that are there, since Python 3.12 without
     asking ``__getattr__``: a wrapper has to have what its map has.
+
+    Parameters
+    ----------
+    field_map
+        The map.
     """
-    missing = (name for name in OPTIONAL if not hasattr(type(wrapper), name))
-    return {name: getattr(field_map, name) for name in missing if hasattr(field_map, name)}
+
+    def __init__(self, field_map: object) -> None:
+        self._map: Any = field_map
+        for name in OPTIONAL:
+            if hasattr(field_map, name) and not hasattr(type(self), name):
+                vars(self)[name] = getattr(field_map, name)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "_map":  # before there is one, as when another process unpacks it
+            raise AttributeError(name)
+        return getattr(self._map, name)
 
 
 @runtime_checkable
@@ -116,7 +130,7 @@ class FieldMap(Protocol):
             If a point is not finite or the shape is wrong.
         """
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, also outside of the map.
 
         Never NaN: away from data the field returns to its mean, so that an optimiser may leave

@@ -11,11 +11,11 @@ where E holds exp(-d^2 / 2 l^2) and D is diagonal, one over the weight of each r
 """
 
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 from pydantic import Field
 from scipy.linalg import lapack
-from scipy.optimize import Bounds, minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist, pdist
 
@@ -23,6 +23,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.training import ThinningOptions, TrainingSet, thinned
 from l2m_gtsam.options import Options
+from l2m_gtsam.solve.minimum import minimised, on_bound
 
 NAMES = ("length_scale", "signal", "noise")
 AXES = 3
@@ -31,7 +32,6 @@ SETTLED = 1.25  # ratio of length scales between rounds below which thinning har
 SPREAD = 4  # readings are drawn from this many times as many nearest ones, see draw_neighbourhoods
 LEAST_SIGNAL = 1e-3  # uT, below which readings do not vary
 SHORTEST = 2e-3  # m, the least length scale that is tried
-BOUND_TOLERANCE = 1e-6  # in the logarithm
 PAIRED = 1500  # readings whose pairs give the start: a million distances
 
 
@@ -248,9 +248,8 @@ def maximise(
         return -total, -np.sum([part.gradient for part in parts], axis=0)
 
     x0 = np.clip(x0, low, high)
-    end = minimize(cost, x0, jac=True, method="L-BFGS-B", bounds=Bounds(low, high))
-    on_bound = np.minimum(end.x - low, high - end.x) < BOUND_TOLERANCE
-    at_bound = tuple(name for name, on in zip(NAMES, on_bound, strict=True) if on)
+    end = minimised(cost, x0, low, high)
+    at_bound = tuple(compress(NAMES, on_bound(end.x, low, high)))
     return LikelihoodFit(
         hyperparameters=from_log(end.x),
         start=start,

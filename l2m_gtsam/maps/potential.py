@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray
 from l2m_gtsam.options import Options
 
 AXES = 3
@@ -128,21 +128,16 @@ class PotentialBasis:
             found[:, i] += np.einsum("nm,nm->n", by[:, j], mixed)
         return found
 
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, of weights of shape (m,)."""
         return self.features(points) @ weights, self.slopes(points) @ weights
 
     def _sines(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return normalised sines and cosines along each axis, shape (N, 3, n)."""
-        S = np.empty((len(points), AXES, len(self.waves)))
+        S, norm = np.empty((len(points), AXES, len(self.waves))), np.sqrt(2 / self.size)
         C = np.empty_like(S)
         for axis, (numbers, own) in enumerate(self._distinct):
-            angle, norm = (
-                np.outer(points[:, axis] - self.low[axis], numbers),
-                np.sqrt(2 / self.size),
-            )
+            angle = np.outer(points[:, axis] - self.low[axis], numbers)
             S[:, axis] = (norm[axis] * np.sin(angle))[:, own]
             C[:, axis] = (norm[axis] * np.cos(angle))[:, own]
         return S, C

@@ -134,10 +134,6 @@ class SuiteErrors:
         np.add.at(change, self.reading, np.einsum("pij,pj->pi", self.shift[:, 3:], own))
         return np.asarray(field - change)
 
-    def from_reading(self, first: int) -> "SuiteErrors":
-        """Return the same of readings that begin with this number."""
-        return replace(self, reading=self.reading + first)
-
     def followed_by(self, other: "SuiteErrors", first: int) -> "SuiteErrors":
         """Return the errors of these readings and of others that are numbered from ``first`` on.
 

@@ -91,10 +91,6 @@ class SurveyPoses:
             shift=self.shift[own],
         )
 
-    def from_reading(self, first: int) -> "SurveyPoses":
-        """Return the same of readings that begin with this number."""
-        return replace(self, reading=self.reading + first)
-
     def followed_by(self, other: "SurveyPoses", first: int) -> "SurveyPoses":
         """Return the errors of these readings and of others that are numbered from ``first`` on."""
         drives = int(self.drive.max(initial=-1)) + 1

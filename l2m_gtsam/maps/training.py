@@ -3,9 +3,9 @@
 What is wrong with a survey shows as far as its readings do, whatever map is made of them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, Self, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +13,8 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.suite_errors import SuiteErrors
+from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.options import Options
 
 FEWEST = 10
@@ -232,27 +234,19 @@ def joined(first: TrainingSet, second: TrainingSet) -> TrainingSet:
     )
 
 
-class ReadingErrors(Protocol):
-    """Errors of readings that are known by their numbers."""
-
-    def followed_by(self, other: Self, first: int) -> Self:
-        """Return them with those of other readings, the first of which has this number."""
-
-    def from_reading(self, first: int) -> Self:
-        """Return the same of readings that begin with this number."""
-
-
-Errors = TypeVar("Errors", bound=ReadingErrors)
+Errors = TypeVar("Errors", SuiteErrors, SurveyPoses)
 
 
 def errors_together(before: Errors | None, after: Errors | None, first: int) -> Errors | None:
-    """Return the errors of readings and of others after them; see ``ReadingErrors.followed_by``.
+    """Return the errors of readings and of others, the first of which has this number then.
 
     Absent are those of what counts as exact.
     """
     if after is None:
         return before
-    return after.from_reading(first) if before is None else before.followed_by(after, first)
+    if before is None:
+        return replace(after, reading=after.reading + first)
+    return before.followed_by(after, first)
 
 
 def survey_doubts(readings: TrainingSet) -> tuple[str, ...]:

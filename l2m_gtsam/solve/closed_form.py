@@ -183,10 +183,7 @@ def row_weights(
 
 
 def fit_distortion(
-    b_lidar: FloatArray,
-    b_meas: FloatArray,
-    weights: FloatArray,
-    options: ClosedFormOptions,
+    b_lidar: FloatArray, b_meas: FloatArray, weights: FloatArray, options: ClosedFormOptions
 ) -> DistortionFit:
     """Solve ``b_meas = C b_lidar + H``.
 

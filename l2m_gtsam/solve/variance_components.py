@@ -24,9 +24,9 @@ from functools import partial
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.linalg.lapack import dtrtri
-from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.solve.minimum import minimised
 
 MOST_UPDATES = 200
 ENOUGH = 0.02  # of a logarithm of likelihood: less than that in an update is no progress
@@ -275,23 +275,17 @@ def shared_components(
     expected = sum(d @ np.diag(each.information) for each, d in zip(systems, spectra, strict=True))
     count = sum(np.count_nonzero(d, axis=1) for d in spectra)
     unit = np.log(np.maximum(count, 1) / np.where(expected > 0, expected, 1.0))
-    bounds = Bounds(unit + np.log(NEGLIGIBLE), unit + np.log(LARGEST))
+    low, high = unit + np.log(NEGLIGIBLE), unit + np.log(LARGEST)
     start, noise = unit, 1.0
     if near is not None:
         # From zero no climb over logarithms comes back.
         known = np.log(np.where(near > 0, near, np.exp(unit)))
-        start = np.clip(known, bounds.lb, bounds.ub)
+        start = np.clip(known, low, high)
     for round_ in range(ROUNDS):
         now = climb if squares is None or round_ == ROUNDS - 1 else SHORT
         white = [each.whiter(noise) for each in systems]
-        end = minimize(
-            partial(_cost, white, spectra),
-            start,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=bounds,
-            options={"maxiter": now.steps, "ftol": now.tolerance},
-        )
+        cost = partial(_cost, white, spectra)
+        end = minimised(cost, start, low, high, now.steps, now.tolerance)
         start = end.x
         sizes = np.where(start > unit + np.log(2 * NEGLIGIBLE), np.exp(start), 0.0)
         found = VarianceComponents(sizes, -2 * float(end.fun), noise)

@@ -11,10 +11,9 @@ import numpy as np
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive, with_calibration
 from l2m_gtsam.calibration.averages import averaged
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
-from l2m_gtsam.calibration.causes import vehicle_gain
 from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected
 from l2m_gtsam.calibration.coverage import errors_over_stated
-from l2m_gtsam.calibration.drive_sources import drive_sources
+from l2m_gtsam.calibration.drive_sources import drive_sources, vehicle_gain
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.view import places_of

@@ -9,7 +9,6 @@ decimetres. The memory is that of one drive: a result must not depend on what wa
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,7 +17,7 @@ from l2m_gtsam.calibration.coverage import MapErrors, UncertainMap
 from l2m_gtsam.calibration.extent import TiledMap
 from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray
-from l2m_gtsam.maps.field_map import optional_members, unknown
+from l2m_gtsam.maps.field_map import WrappedMap, unknown
 from l2m_gtsam.maps.training import checked_points
 
 # Metres between places whose errors are the same numbers. What these do to a reading is taken at
@@ -93,7 +92,7 @@ class KnownVariance:
         )
 
 
-class MapAlongDrive:
+class MapAlongDrive(WrappedMap):
     """A map that knows its errors, with a memory of them for one drive; else the map itself.
 
     Field and gradient are always those of the place itself.
@@ -105,15 +104,9 @@ class MapAlongDrive:
     """
 
     def __init__(self, field_map: QueryableMap) -> None:
-        self._map: Any = field_map
+        super().__init__(field_map)
         self._errors: deque[KnownErrors] = deque(maxlen=MOST)
         self._variance = KnownVariance.nowhere()
-        vars(self).update(optional_members(field_map, self))
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "_map":  # before there is one, as when another process unpacks it
-            raise AttributeError(name)
-        return getattr(self._map, name)
 
     def __reduce__(self) -> tuple[type["MapAlongDrive"], tuple[QueryableMap]]:
         return MapAlongDrive, (self._map,)

@@ -14,10 +14,9 @@ import numpy as np
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive, with_calibration
 from l2m_gtsam.calibration.averages import averaged
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
-from l2m_gtsam.calibration.causes import changed_sources
 from l2m_gtsam.calibration.changed_places import ChangesOptions, is_place_of, suspected
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
-from l2m_gtsam.calibration.drive_sources import DriveSources, drive_sources
+from l2m_gtsam.calibration.drive_sources import DriveSources, changed_sources, drive_sources
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.offset_courses import Course, FoundCourses, courses_of
 from l2m_gtsam.calibration.view import QueryableMap

@@ -8,8 +8,7 @@ from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, TermSum
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import add_waves
 from l2m_gtsam.maps.harmonic.near_sources import PointSources, near_sources
-from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid
-from l2m_gtsam.maps.harmonic.spline import spline_derivatives
+from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid, spline_derivatives
 from l2m_gtsam.solve.profile import write_trimmed
 
 COUNT, WAVES = 400, 60

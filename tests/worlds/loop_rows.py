@@ -6,7 +6,7 @@ from scipy.sparse import csr_array, eye_array
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.source import SourceShape
-from l2m_gtsam.solve.row_blocks import RowBlocks
+from l2m_gtsam.solve.linear_algebra import RowBlocks
 
 NOISE_UT = 0.1
 DIPOLE = SourceShape.dipole(np.array([1.0, 0.8, 0.5]), np.array([3.0, -2.0, 9.0]))

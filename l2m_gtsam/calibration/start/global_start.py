@@ -207,10 +207,7 @@ def reached(candidates: "StartCandidates", followed: dict[Node, Basin]) -> list[
 
 
 def found_start(
-    candidates: "StartCandidates",
-    reached: Sequence[Basin],
-    options: StartOptions,
-    in_map: InMap,
+    candidates: "StartCandidates", reached: Sequence[Basin], options: StartOptions, in_map: InMap
 ) -> FoundStart | None:
     """Return the best of the basins that a sensor's candidates led to, beside the second best.
 

@@ -18,7 +18,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import FieldSample, FloatArray, MapState
+from l2m_gtsam.data import FieldAndGradient, FieldSample, FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.bilinear.lattice import (
     BilinearOptions,
@@ -137,7 +137,7 @@ class BilinearMap:
         inside = np.asarray(away <= self.options.reach)
         return masked(FieldSample(field, gradient, self.variance(points), inside))
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient, outside those of the nearest data; see ``FieldMap``."""
         return self.lattice.field_and_gradient(checked_points(points))
 

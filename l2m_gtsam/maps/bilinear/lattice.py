@@ -7,7 +7,7 @@ from pydantic import Field
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError, cKDTree
 
-from l2m_gtsam.data import FloatArray, IntArray, MapState
+from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.trained import state_array
 from l2m_gtsam.maps.training import FURTHEST, TrainingSet, checked_points
@@ -160,7 +160,7 @@ class Lattice:
     axes: tuple[FloatArray, FloatArray, FloatArray]
     values: FloatArray
 
-    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and its exact gradient (N, 3, 3) in uT/m.
 
         Points outside of the box, in metres, shape (N, 3), take the value of its nearest point.

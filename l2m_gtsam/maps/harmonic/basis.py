@@ -7,7 +7,7 @@ from itertools import chain, compress
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles, moment_features
 from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, UniformField, WeightPrior
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame, turn_rows
@@ -89,9 +89,7 @@ class Basis:
             turn_rows(self.frame.R_map_tile, rows)
         return rows
 
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
         field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
         R = self.frame.R_map_tile
@@ -153,10 +151,9 @@ def basis_of(
 
 def basis_with(frame: TileFrame, resolution: Resolution, dipoles: Sequence[Dipoles]) -> Basis:
     """Return the basis of a box with these sources."""
-    families: list[Family] = [UniformField(UNIFORM_SIGMA)]
-    families.append(modes_up_to(FLOOR, frame.size, 0.0, resolution.floor))
-    families.append(modes_up_to(CEILING, frame.size, frame.height, resolution.ceiling))
-    families += dipoles
+    floor = modes_up_to(FLOOR, frame.size, 0.0, resolution.floor)
+    ceiling = modes_up_to(CEILING, frame.size, frame.height, resolution.ceiling)
+    families: tuple[Family, ...] = (UniformField(UNIFORM_SIGMA), floor, ceiling, *dipoles)
     return Basis(frame, tuple(family for family in families if len(family)))
 
 

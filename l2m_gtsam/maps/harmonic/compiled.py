@@ -9,18 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, TermSum, compile_tile, sources_of
+from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, TermSum, compile_tile
 from l2m_gtsam.maps.harmonic.entries import compiled_entry, finite, floats, integers
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.near_sources import NearSources
 from l2m_gtsam.maps.harmonic.places import AlongX, Places
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid
-from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_shares import Blend
-from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.maps.harmonic.tiles import Tile, Tiles
 from l2m_gtsam.maps.tile_store import Arrays, Entry
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.progress import Count
@@ -142,7 +141,7 @@ class CompiledTiles:
 
         return sum(in_threads(make, indices))
 
-    def blended(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def blended(self, points: FloatArray) -> FieldAndGradient:
         """Return the blended prediction of the tiles at points."""
         blend = Blend.of(len(points))
         for part in self.learnt.tiling.by_tile(points):
@@ -200,12 +199,7 @@ def compiled_from_arrays(
         return solved()
     low, high = finite(arrays, "walls", (2, 3))
     grid, near = grid_from_arrays(arrays), near_from_arrays(arrays)
-    return CompiledTile(frame, (low, high), grid, near, lambda: all_terms(solved()))
-
-
-def all_terms(tile: Tile) -> TermSum:
-    """Return all terms of a tile."""
-    return TermSum.of(tile, sources_of(tile))
+    return CompiledTile(frame, (low, high), grid, near, lambda: TermSum.of(solved()))
 
 
 def grid_from_arrays(arrays: Arrays) -> PotentialGrid:

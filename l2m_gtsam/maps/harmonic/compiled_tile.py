@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles, add_dipoles
 from l2m_gtsam.maps.harmonic.family import Family
@@ -23,8 +23,8 @@ from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, near_sources
 from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid, PotentialLattice, potential_grid
-from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_shares import Blend
+from l2m_gtsam.maps.harmonic.tiles import Tile
 from l2m_gtsam.maps.harmonic.tiling import WAVE_NUMBERS
 
 FIELD_TOLERANCE = 0.005  # uT
@@ -54,13 +54,13 @@ class TermSum:
     others: tuple[tuple[Family, FloatArray], ...]
 
     @classmethod
-    def of(cls, tile: Tile, sources: PointSources) -> "TermSum":
+    def of(cls, tile: Tile) -> "TermSum":
         """Return the terms of a tile with the mean of its weights, and all of its dipoles."""
         families = zip(tile.basis.families, tile.basis.columns, strict=True)
         others = ((f, tile.weights.mean[at]) for f, at in families if not isinstance(f, Dipoles))
-        return cls(sources, tuple(others))
+        return cls(sources_of(tile), tuple(others))
 
-    def field_and_gradient(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, local: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the tile's frame."""
         field, gradient = np.zeros((len(local), 3)), np.zeros((len(local), 3, 3))
         for family, weights in self.others:
@@ -116,7 +116,7 @@ class CompiledTile:
         """All terms of the exact tile."""
         return self.exact()
 
-    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
         blend = Blend.of(len(points))
         self.add_to(blend, points, np.arange(len(points)), np.ones(len(points)))
@@ -149,9 +149,7 @@ class CompiledTile:
             blend.add(rows[left], share[left], values)
 
 
-def in_map(
-    frame: TileFrame, field: FloatArray, gradient: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def in_map(frame: TileFrame, field: FloatArray, gradient: FloatArray) -> FieldAndGradient:
     """Return field (N, 3) and gradient (N, 3, 3) of a tile's frame in the map frame."""
     R = frame.R_map_tile
     if np.array_equal(R, np.eye(3)):
@@ -191,12 +189,11 @@ def compile_tile(tile: Tile, places: Places) -> CompiledTile | Tile:
     How fine follows from waves and sources, then from the error at places drawn at random and
     beside sources. If no grid of a sensible size is good enough the exact tile remains.
     """
-    sources = sources_of(tile)
-    checks = check_places(tile, sources, places)
+    terms = TermSum.of(tile)
+    checks = check_places(tile, terms.sources, places)
     if not len(checks):
         return tile
-    fineness = fineness_for(tile, sources)
-    terms = TermSum.of(tile, sources)
+    fineness = fineness_for(tile, terms.sources)
     frame = tile.basis.frame
     truth = in_map(frame, *terms.field_and_gradient(tile.clipped(frame.localise(checks))))
     for _ in range(ATTEMPTS):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray
 from l2m_gtsam.maps.harmonic.family import Hyperparameters, WeightPrior
 from l2m_gtsam.maps.harmonic.triangular import FAST, add_symmetric
 
@@ -54,9 +54,7 @@ class Dipoles:
         flat = len(moments), 3 * len(points)
         np.matmul(mixed, moments.reshape(flat), out=rows.reshape(len(rows), flat[1]))
 
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return field and gradient; see ``Family``."""
         field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
         add_dipoles(points, self.positions, self.moments(weights), field, gradient)

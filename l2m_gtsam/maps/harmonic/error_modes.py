@@ -31,10 +31,9 @@ from scipy.linalg.lapack import dpstrf
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, Learnt
-from l2m_gtsam.maps.harmonic.tile import Tile, TileModes
 from l2m_gtsam.maps.harmonic.tile_correlation import joint_covariance
 from l2m_gtsam.maps.harmonic.tile_sums import tile_pull
-from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.maps.harmonic.tiles import Tile, TileModes, Tiles
 from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.solve.linear_algebra import covariance_root
@@ -173,11 +172,7 @@ class MovedTiles:
 
 
 def error_modes(
-    learnt: Learnt,
-    tiles: Tiles,
-    moved: MovedTiles,
-    points: FloatArray,
-    options: ErrorOptions,
+    learnt: Learnt, tiles: Tiles, moved: MovedTiles, points: FloatArray, options: ErrorOptions
 ) -> ErrorModes:
     """Return the error of a map over places.
 

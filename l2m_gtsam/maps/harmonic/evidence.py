@@ -18,8 +18,11 @@ to the readings, the noise has the covariance
     K_E K_E^T = 1 + E^T W E / \sigma^2
 """
 
+import operator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
@@ -111,22 +114,14 @@ class Normal:
     log_weight: float
 
     def __add__(self, other: "Normal") -> "Normal":
-        return Normal(
-            self.FF + other.FF,
-            self.Fy + other.Fy,
-            self.yy + other.yy,
-            self.rows + other.rows,
-            self.log_weight + other.log_weight,
-        )
+        return self._with(other, operator.add)
 
     def __sub__(self, other: "Normal") -> "Normal":
-        return Normal(
-            self.FF - other.FF,
-            self.Fy - other.Fy,
-            self.yy - other.yy,
-            self.rows - other.rows,
-            self.log_weight - other.log_weight,
-        )
+        return self._with(other, operator.sub)
+
+    def _with(self, other: "Normal", combined: Callable[[Any, Any], Any]) -> "Normal":
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Normal(*(combined(*pair) for pair in pairs))
 
 
 def normal_of(basis: Basis, readings: TrainingSet, shared: SharedNoise | None = None) -> Normal:

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray
 from l2m_gtsam.options import Options
 
 
@@ -82,9 +82,7 @@ class Family(Protocol):
             For the field in uT, one weight after the other, shape (m, 3, N), in C order.
         """
 
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return the field (N, 3) in uT and its gradient (N, 3, 3) in uT/m for given weights."""
 
 
@@ -111,9 +109,7 @@ class UniformField:
         """Write the same for all points; see ``Family``."""
         rows[:] = np.diag(units)[:, :, None]
 
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return field and gradient; see ``Family``."""
         return np.tile(weights, (len(points), 1)), np.zeros((len(points), 3, 3))
 

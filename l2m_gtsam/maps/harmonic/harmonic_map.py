@@ -7,7 +7,7 @@ from typing import ClassVar, Self
 import numpy as np
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, MapState
+from l2m_gtsam.data import FieldAndGradient, FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, MovedTiles, error_modes, tile_modes
@@ -15,8 +15,7 @@ from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.pose_sizes import with_pose_errors
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
-from l2m_gtsam.maps.harmonic.suite_found import with_errors_found
-from l2m_gtsam.maps.harmonic.suite_sizes import sized, stated_doubts, suite_sizes
+from l2m_gtsam.maps.harmonic.suite_sizes import sized, stated_doubts, suite_sizes, with_errors_found
 from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tile_shares import Blend, TilePoints
@@ -41,23 +40,6 @@ PIECE = 65_536  # about the most points of a share
 BLOCK = 0.5  # metres: what a map knows of a square of this size fits the processor's cache
 SERIAL = 6_000  # fewer points than this are not worth threads
 FEW = 32  # the same of their variance, a hundred times as slow
-
-
-@dataclass(frozen=True)
-class TileShare:
-    """What one tile predicts at the points that it has a share in.
-
-    Attributes
-    ----------
-    values
-        Field in uT and gradient in uT/m of all these points, shapes (N, 3) and (N, 3, 3).
-    own, variance
-        Which of the points lie in the tile's core, shape (N,), and the variance there, (K, 3).
-    """
-
-    values: tuple[FloatArray, FloatArray]
-    own: BoolArray
-    variance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -204,7 +186,13 @@ class HarmonicMap:
             for index, cell in enumerate(learnt.tiling.grid.cells.tolist())
             if not touched[index] and old.get(tuple(cell)) in solved
         }
-        return HarmonicMap(learnt, self.options, Tiles(learnt, kept), frame=self.frame)
+        return self._formed(
+            HarmonicMap(learnt, self.options, Tiles(learnt, kept), frame=self.frame)
+        )
+
+    def _formed(self, plain: "HarmonicMap") -> "HarmonicMap":
+        """Return a map in the form that this one has."""
+        return plain
 
     @classmethod
     def from_state(cls, state: MapState) -> "HarmonicMap":
@@ -286,15 +274,15 @@ class HarmonicMap:
         blend, variance = Blend.of(len(points)), np.empty_like(points)
         parts, owner = self.learnt.tiling.by_tile(points), self.learnt.tiling.grid.block_of(points)
 
-        def answer(part: TilePoints) -> TileShare:
+        def answer(part: TilePoints) -> tuple[FloatArray, FloatArray]:
             # All points of a tile at once: it may not stay in memory.
             tile, at = self.tiles[part.tile], points[part.rows]
             own = owner[part.rows] == part.tile
-            return TileShare(tile.field_and_gradient(at), own, tile.variance(at[own]))
+            variance[part.rows[own]] = tile.variance(at[own])
+            return tile.field_and_gradient(at)
 
-        for part, found in zip(parts, in_threads(answer, parts), strict=True):
-            blend.add(part.rows, part.share, found.values)
-            variance[part.rows[found.own]] = found.variance
+        for part, values in zip(parts, in_threads(answer, parts), strict=True):
+            blend.add(part.rows, part.share, values)
         return blend.field, blend.gradient, variance
 
     def compile(self) -> "CompiledMap":
@@ -309,7 +297,7 @@ class HarmonicMap:
     def _compiled(self) -> CompiledTiles:
         return CompiledTiles.of(self.learnt, self.options, self.tiles)
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
         blend = Blend.of(len(points))
@@ -387,7 +375,7 @@ class CompiledMap(HarmonicMap):
     def _answers(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         return *self.field_and_gradient(points), self.variance(points)
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
         if len(points) < SERIAL:
@@ -400,16 +388,8 @@ class CompiledMap(HarmonicMap):
         in_threads(answer, np.array_split(by_place(points), max(SHARES, len(points) // PIECE)))
         return field, gradient
 
-    def updated(
-        self,
-        points: FloatArray,
-        field: FloatArray,
-        suite: SuiteErrors | None = None,
-        poses: SurveyPoses | None = None,
-        /,
-    ) -> "CompiledMap":
-        """Return the map with more readings; see ``FieldMap``."""
-        return super().updated(points, field, suite, poses).compile()
+    def _formed(self, plain: HarmonicMap) -> HarmonicMap:
+        return plain.compile()
 
 
 def by_place(points: FloatArray) -> IntArray:

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from pydantic import Field
-from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import COARSE, Basis, basis_of
@@ -29,9 +29,9 @@ from l2m_gtsam.maps.trained import learning_words
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.solve.minimum import minimised, on_bound
 
 ROUNDS = 2  # learning is repeated while it asks for finer modes than it looked at
-BOUND_TOLERANCE = 1e-6
 FURTHEST = np.log(300.0)  # from where a search starts
 NOISIER = 10.0  # times the usual noise, from where it starts again
 BETTER = 1.0  # nats: less is the same maximum
@@ -141,7 +141,9 @@ def learn(
         # Finer modes than those in the windows would have changed their likelihood.
         if needed.floor < FINER * looked_at.floor and needed.ceiling < FINER * looked_at.ceiling:
             break
-    return replace(end, roughest=tuple(own(each, end.hyperparameters) for each in windows.rough))
+    of_map, local = end.hyperparameters, LocalOptions()
+    rough = (local_hyperparameters(w.basis, w.normal, of_map, local) for w in windows.rough)
+    return replace(end, roughest=tuple(rough))
 
 
 def starting_point(readings: TrainingSet) -> Hyperparameters:
@@ -171,11 +173,6 @@ def draw_windows(
     spread = spread_tiles(tiling, members, learning.windows)
     rough = rough_tiles(readings, members, learning.rough, spread)
     return Windows([window(tile) for tile in spread], [window(tile) for tile in rough])
-
-
-def own(window: Window, hyperparameters: Hyperparameters) -> Hyperparameters:
-    """Return the scales and depths of a window by itself."""
-    return local_hyperparameters(window.basis, window.normal, hyperparameters, LocalOptions())
 
 
 def window_of(
@@ -209,16 +206,8 @@ def maximise(
         )
         return -sum(part.value for part in parts), -gradient
 
-    end = minimize(
-        cost,
-        x0,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=Bounds(low, high),
-        options={"maxiter": 60, "ftol": 1e-6},
-    )
-    on_bound = np.minimum(end.x - low, high - end.x) < BOUND_TOLERANCE
-    at_bound = tuple(name for name, on in zip(names, on_bound, strict=True) if on)
+    end = minimised(cost, x0, low, high, steps=60, tolerance=1e-6)
+    at_bound = tuple(compress(names, on_bound(end.x, low, high)))
     return LearningEnd(
         hyperparameters=moved(start, names, end.x),
         log_likelihood=-float(end.fun),

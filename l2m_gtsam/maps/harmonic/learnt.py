@@ -175,6 +175,11 @@ class Learnt:
         varied = float(self.readings.field.var(axis=0).sum())
         return max(KNOWN * varied, 3 * self.hyperparameters.noise**2)
 
+    @cached_property
+    def past(self) -> History:
+        """What the readings went through: those of a map without history are of one drive."""
+        return self.history or History.of_survey(len(self.readings), UNDATED)
+
     def basis(self, tile: int, rows: IntArray, visible: float = FINE) -> Basis:
         """Return the basis of a tile for its readings; ``visible`` is that of ``dipoles_of``."""
         centre, edge = self.tiling.grid.centres[tile], self.tiling.edge
@@ -195,17 +200,16 @@ class Learnt:
 
     def present(self, tile: int) -> IntArray:
         """Return the rows of a tile's readings since which its field has not moved."""
-        rows = self.members[tile]
-        if self.history is None:
-            return rows
-        steps = self.history.steps_of(self.tiling.grid.cells[tile])
+        rows, moved = self.members[tile], np.flatnonzero(self.moved_before(tile))
+        return rows[self.past.drive[rows] >= (moved[-1] if len(moved) else 0)]
+
+    def moved_before(self, tile: int) -> list[bool]:
+        """Return before which drives the field of a tile moved, or structures near it changed."""
+        steps = self.past.steps_of(self.tiling.grid.cells[tile])
         near = self.structure_numbers(tile)
-        moved = [
-            k
-            for k, step in enumerate(steps)
-            if step.share > 0 or any(self.history.freed_before(k, near))
+        return [
+            step.share > 0 or any(self.past.freed_before(k, near)) for k, step in enumerate(steps)
         ]
-        return rows[self.history.drive[rows] >= (moved[-1] if moved else 0)]
 
     def structure_numbers(self, tile: int) -> list[int]:
         """Return the numbers of the structures in or near a tile that have a field."""
@@ -238,11 +242,7 @@ class Learnt:
         return replace(learnt, poses=wrong_poses)
 
     def followed_by(
-        self,
-        new: TrainingSet,
-        options: HarmonicOptions,
-        suite: SuiteErrors | None,
-        drive: MapDrive,
+        self, new: TrainingSet, options: HarmonicOptions, suite: SuiteErrors | None, drive: MapDrive
     ) -> "Learnt":
         """Return the same with the readings of a new drive, which stay apart from earlier ones.
 
@@ -257,7 +257,6 @@ class Learnt:
         drive
             When it was.
         """
-        history = self.history or History.of_survey(len(self.readings), UNDATED)
         new, suite = self.as_found(new, suite)
         owner = cubes_of(new.points, options.merge)
         own = None if suite is None else suite.averaged(owner, new.weight)
@@ -266,7 +265,7 @@ class Learnt:
         together = joined(self.readings, added)
         # Steel that came between two drives is no fault of a survey: each is doubted by itself.
         learnt = self._of(together, errors, new, len(new), options)
-        return replace(learnt, history=history.followed_by(len(added), drive))
+        return replace(learnt, history=self.past.followed_by(len(added), drive))
 
     def as_found(
         self, new: TrainingSet, suite: SuiteErrors | None

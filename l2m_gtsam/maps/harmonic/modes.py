@@ -20,7 +20,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numba import njit
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.family import Hyperparameters, WeightPrior
 from l2m_gtsam.maps.harmonic.triangular import FAST, add_symmetric
 
@@ -106,9 +106,7 @@ class Modes:
         factors = np.stack([-self.kx, -self.ky, self.kz]) * units
         write_wave_rows(*self._tables(points), self.numbers, growth, which, factors, rows)
 
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return field and gradient; see ``Family``."""
         field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
         steps = np.pi / self.size

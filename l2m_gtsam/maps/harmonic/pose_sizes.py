@@ -179,18 +179,13 @@ def gain_elsewhere(views: Sequence[PoseView], fit: VarianceComponents) -> float:
     return fit.gain - max(gains) if len(gains) > 1 else fit.gain
 
 
-def lasting(learnt: Learnt, tiles: Tiles, poses: SurveyPoses) -> bool:
-    """Return whether a survey is more likely with stated errors that last than with exact poses.
-
-    Errors that every pose has of its own are noise of each reading, which a map has learnt.
-    """
-    seen = pose_views(learnt, tiles, poses)
-    return sum(each.system.posterior(np.ones(len(each.part))).likelihood for each in seen) > 0
+def gain_as_stated(seen: Sequence[PoseView]) -> float:
+    """Return the logarithm of likelihood of stated errors that last, beyond that of exact poses."""
+    return sum(each.system.posterior(np.ones(len(each.part))).likelihood for each in seen)
 
 
-def noise_beside(learnt: Learnt, tiles: Tiles, poses: SurveyPoses) -> float:
+def noise_beside(seen: Sequence[PoseView]) -> float:
     """Return the share of the noise's variance that is left beside errors of stated sizes."""
-    seen = pose_views(learnt, tiles, poses)
     return noise_left(
         [each.system for each in seen],
         [np.ones(len(each.part)) for each in seen],
@@ -271,10 +266,11 @@ def with_pose_errors(
         Of the map.
     """
     if poses.stated:
-        if not poses.duration_stated and not lasting(learnt, tiles, poses):
+        seen = pose_views(learnt, tiles, poses)
+        # Errors that every pose has of its own are noise of each reading, which a map has learnt.
+        if not poses.duration_stated and not gain_as_stated(seen) > 0:
             return None
-        share = noise_beside(learnt, tiles, poses)
-        return relearnt(replace(quieter(learnt, share), poses=poses), options)
+        return relearnt(replace(quieter(learnt, noise_beside(seen)), poses=poses), options)
     if options.hyperparameters is not None:  # with the noise that is given there is nothing to find
         return None
     found, current = pose_sizes(learnt, tiles, poses), learnt

@@ -51,10 +51,7 @@ class DriveReadings:
 
 
 def renewed(
-    field_map: HarmonicMap,
-    new: DriveReadings,
-    changes: Sequence[DatedChange],
-    survey: MapDrive,
+    field_map: HarmonicMap, new: DriveReadings, changes: Sequence[DatedChange], survey: MapDrive
 ) -> HarmonicMap:
     """Return a map as a drive found the place.
 
@@ -98,7 +95,7 @@ def with_places(learnt: Learnt, changes: Sequence[DatedChange]) -> Learnt:
     What a source is beside its dipole, or its bar, is not what earlier readings were given: they
     tell nothing of structures that changed.
     """
-    if not changes or learnt.history is None:
+    if not changes:
         return learnt
     middles, reach = learnt.sources.middles, []
     first, positions, numbers, strengths = len(learnt.strengths), [], [], []
@@ -123,27 +120,23 @@ def with_places(learnt: Learnt, changes: Sequence[DatedChange]) -> Learnt:
         learnt,
         sources=sources,
         strengths=np.append(learnt.strengths, strengths),
-        history=learnt.history.with_freed(others.astype(np.int64)),
+        history=learnt.past.with_freed(others.astype(np.int64)),
     )
 
 
 def with_steps(learnt: Learnt, points: FloatArray) -> Learnt:
     """Return the same with the steps of the tiles that new readings take part in."""
-    history, grid = learnt.history, learnt.tiling.grid
-    if history is None:
-        return learnt
+    grid = learnt.tiling.grid
     away, _ = cKDTree(points[:, :2]).query(grid.centres, p=np.inf)
     touched = np.flatnonzero(np.asarray(away) <= 0.5 * grid.size + learnt.tiling.overlap).tolist()
     steps = in_threads(lambda tile: likeliest_step(learnt, tile), touched)
     found = dict(zip(touched, steps, strict=True))
-    return replace(learnt, history=history.with_steps(grid, found))
+    return replace(learnt, history=learnt.past.with_steps(grid, found))
 
 
 def told(learnt: Learnt, changes: Sequence[DatedChange]) -> Learnt:
     """Return the same with what changed in its diary, and where earlier readings count less."""
-    history, grid = learnt.history, learnt.tiling.grid
-    if history is None:
-        return learnt
+    history, grid = learnt.past, learnt.tiling.grid
     last, faded = history.drives - 1, []
     for tile, cell in enumerate(grid.cells):
         if history.steps_of(cell)[last].share > 0:
@@ -158,10 +151,7 @@ def told(learnt: Learnt, changes: Sequence[DatedChange]) -> Learnt:
 
 def without_outdated(learnt: Learnt, options: HarmonicOptions) -> Learnt:
     """Return the same without readings of which nothing is left: their tile moved altogether."""
-    history = learnt.history
-    if history is None:
-        return learnt
-    owner = learnt.tiling.grid.block_of(learnt.readings.points)
+    history, owner = learnt.past, learnt.tiling.grid.block_of(learnt.readings.points)
     since = np.array([outdated(history, cell) for cell in learnt.tiling.grid.cells])
     keep = history.drive >= since[owner]
     return learnt if keep.all() else learnt.only(keep, options)

@@ -1,6 +1,5 @@
 """What a harmonic map was learnt from as plain arrays, and back with checks."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -65,8 +64,15 @@ def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapS
             "freed": history.freed,
         }
         origin |= {"diary": DIARY.dump_python(history.diary, mode="json")}
-    if learnt.poses is not None:
-        arrays |= poses_to_arrays(learnt.poses)
+    if (poses := learnt.poses) is not None:
+        arrays |= {
+            "pose_pairs": np.stack([poses.reading, poses.drive]),
+            "pose_seconds": poses.seconds,
+            "pose_shift": poses.shift.astype(np.float32),
+            "pose_lasting": np.array([poses.lasting_s]),
+            "pose_stated": np.array([int(poses.stated)]),
+            "pose_sizes": np.ones(POSE) if poses.sizes is None else poses.sizes,
+        }
     return MapState(kind, arrays, options.model_dump(mode="json"), origin)
 
 
@@ -88,8 +94,6 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
     sources, strengths = sources_from_state(state)
     resolution = resolution_from_state(state)
     tiling = tiling_from_state(state, readings, resolution, options)
-    local = options.effective_local
-    suite = suite_from_state(state, len(readings))
     learnt = Learnt(
         readings,
         hyperparameters,
@@ -97,12 +101,13 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
         strengths,
         tiling,
         resolution,
-        local,
+        options.effective_local,
         origin,
-        suite,
+        suite_from_state(state, len(readings)),
         history_from_state(state, len(readings), len(strengths)),
+        poses_from_state(state, len(readings)),
     )
-    return replace(learnt, poses=poses_from_state(state, len(readings))), options
+    return learnt, options
 
 
 def damaged(what: str, complaint: str) -> MapError:
@@ -254,19 +259,6 @@ def history_from_state(state: MapState, count: int, structures: int) -> History 
         raise damaged("history is", "a step is none, or of a tile that is nowhere")
     whole = [each.astype(np.int64) for each in (drive, cells, freed)]
     return History(whole[0], whole[1], shares, depths, whole[2], diary)
-
-
-def poses_to_arrays(poses: SurveyPoses) -> dict[str, npt.NDArray[Any]]:
-    """Return errors of poses as arrays, in units of their standard deviations."""
-    sizes = np.ones(POSE) if poses.sizes is None else poses.sizes
-    return {
-        "pose_pairs": np.stack([poses.reading, poses.drive]),
-        "pose_seconds": poses.seconds,
-        "pose_shift": poses.shift.astype(np.float32),
-        "pose_lasting": np.array([poses.lasting_s]),
-        "pose_stated": np.array([int(poses.stated)]),
-        "pose_sizes": sizes,
-    }
 
 
 def poses_from_state(state: MapState, count: int) -> SurveyPoses | None:

@@ -5,14 +5,13 @@ from functools import cached_property
 
 import numpy as np
 from pydantic import Field
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.training import FURTHEST
 from l2m_gtsam.options import Options
+from l2m_gtsam.solve.linear_algebra import parts_of
 
 MOST_SOURCES = 200_000
 MOST_REACH = 2.0  # metres; tiles see no structure further away
@@ -195,10 +194,7 @@ def structures_of(centres: FloatArray, options: StructureOptions) -> IntArray:
         return np.empty(0, dtype=np.int64)
     # Neighbours by a face, an edge or a corner: a cube's diagonal is 1.73 edges.
     touching = cKDTree(centres).query_pairs(1.8 * options.edge, output_type="ndarray")
-    graph = coo_array(
-        (np.ones(len(touching)), (touching[:, 0], touching[:, 1])), shape=(len(centres),) * 2
-    )
-    _, component = connected_components(graph, directed=False)
+    component = parts_of(touching, len(centres))
     cell = np.floor(centres[:, :2] / options.piece).astype(np.int64)
     _, piece = np.unique(np.column_stack([component, cell]), axis=0, return_inverse=True)
     return np.asarray(piece, dtype=np.int64)

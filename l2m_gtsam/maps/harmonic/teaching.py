@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
@@ -34,6 +33,7 @@ from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import rough_tiles, spread_tiles
 from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged, survey_doubts
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.solve.minimum import minimised
 
 # Tiles whose held-out places show whether the field is explained, and those of them where the
 # readings are roughest.
@@ -215,14 +215,7 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
         return -result.value, -2 * slope
 
     low, high = np.log(RANGE)
-    end = minimize(
-        cost,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=Bounds(low, high),
-        options={"maxiter": STEPS, "ftol": 1e-7},
-    )
+    end = minimised(cost, start, low, high, STEPS, 1e-7)
     determined = determined_weights(alone, given + 2 * (end.x - start)[owner], noise)
     # Effective number of weights that the readings determine (MacKay 1992), by structure.
     count = np.bincount(owner, determined)

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, tril
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.evidence import SharedNoise
 from l2m_gtsam.maps.harmonic.learnt import Learnt
-from l2m_gtsam.maps.harmonic.tile import TileModes
+from l2m_gtsam.maps.harmonic.tiles import TileModes
 from l2m_gtsam.maps.survey_poses import ErrorKnots, SurveyPoses
 from l2m_gtsam.parallel.threads import in_threads
 

@@ -120,10 +120,9 @@ def carried_here(
     learnt: Learnt, index: int, basis: Basis, numbers: Sequence[int], normals: Sequence[Normal]
 ) -> Normal:
     """Return sums over the readings of some drives for a tile's weights as they are now."""
-    history = learnt.history
-    if history is None or len(normals) < 2:
+    if len(normals) < 2:
         return normals[0]
-    steps = history.steps_of(learnt.tiling.grid.cells[index])
+    steps = learnt.past.steps_of(learnt.tiling.grid.cells[index])
     moved = []
     for first, last in pairwise(numbers):
         between = range(first + 1, last + 1)
@@ -134,21 +133,17 @@ def carried_here(
 
 def by_drive(learnt: Learnt, index: int, rows: IntArray) -> list[tuple[int, IntArray]]:
     """Return readings of a tile drive by drive, those between which it did not move together."""
-    history = learnt.history
-    if history is None or not len(rows):
+    if not len(rows):
         return [(0, rows)]
-    steps = history.steps_of(learnt.tiling.grid.cells[index])
-    near = learnt.structure_numbers(index)
-    moved = [step.share > 0 or any(history.freed_before(k, near)) for k, step in enumerate(steps)]
-    group = np.maximum.accumulate(np.where(moved, np.arange(len(steps)), 0))
-    own = group[history.drive[rows]]
+    moved = learnt.moved_before(index)
+    group = np.maximum.accumulate(np.where(moved, np.arange(len(moved)), 0))
+    own = group[learnt.past.drive[rows]]
     return [(int(number), rows[own == number]) for number in np.unique(own)]
 
 
 def moved_by(learnt: Learnt, index: int, basis: Basis, drive: int, step: TileStep) -> FloatArray:
     """Return how far each weight of a tile moved before a drive: rho, shape (m,)."""
-    near, history = learnt.structure_numbers(index), learnt.history
-    freed = [False] * len(near) if history is None else history.freed_before(drive, near)
+    freed = learnt.past.freed_before(drive, learnt.structure_numbers(index))
     others, moved = iter(freed), np.zeros(len(basis))
     scale = learnt.hyperparameters.floor_scale
     for columns, family in zip(basis.columns, basis.families, strict=True):
@@ -163,9 +158,7 @@ def moved_by(learnt: Learnt, index: int, basis: Basis, drive: int, step: TileSte
 
 def likeliest_step(learnt: Learnt, index: int) -> TileStep:
     """Return how far a tile moved before the last drive, whose readings it has already."""
-    history, rows = learnt.history, learnt.members[index]
-    if history is None:
-        return STILL
+    history, rows = learnt.past, learnt.members[index]
     last = history.drives - 1
     new_rows = rows[history.drive[rows] == last]
     if not len(new_rows) or len(new_rows) == len(rows):
@@ -173,7 +166,8 @@ def likeliest_step(learnt: Learnt, index: int) -> TileStep:
     basis = learnt.basis(index, rows)
     before = tile_normal(learnt, index, basis, np.setdiff1d(rows, new_rows))
     new = normal_of(basis, learnt.readings[new_rows])
-    log_variance, noise = basis.prior(learnt.hyperparameters).log_variance, noise_of(learnt)
+    known = learnt.hyperparameters
+    log_variance, noise = basis.prior(known).log_variance, known.noise
     # Weights that no reading tells anything of are none here: they are most of all.
     told = np.exp(log_variance) * np.diag((before + new).FF) / noise**2 > INFORMATIVE
     before, new, variance = among(before, told), among(new, told), log_variance[told]
@@ -203,25 +197,18 @@ def among(normal: Normal, kept: BoolArray) -> Normal:
 
 def kept_share(learnt: Learnt, index: int) -> float:
     """Return what is left of what readings before the last drive knew of a tile, 0 to 1."""
-    history, rows = learnt.history, learnt.members[index]
-    if history is None:
-        return 1.0
+    history, rows = learnt.past, learnt.members[index]
     last = history.drives - 1
     basis = learnt.basis(index, rows)
     earlier = tile_normal(learnt, index, basis, rows[history.drive[rows] < last])
     step = history.steps_of(learnt.tiling.grid.cells[index])[last]
-    moved = moved_by(learnt, index, basis, last, step)
-    return share_left(earlier, prior_sigma(learnt, basis), noise_of(learnt), moved)
+    moved, noise = moved_by(learnt, index, basis, last, step), learnt.hyperparameters.noise
+    return share_left(earlier, prior_sigma(learnt, basis), noise, moved)
 
 
 def prior_sigma(learnt: Learnt, basis: Basis) -> FloatArray:
     """Return the standard deviations of the weights' prior, that of the whole map, shape (m,)."""
     return np.asarray(np.exp(0.5 * basis.prior(learnt.hyperparameters).log_variance))
-
-
-def noise_of(learnt: Learnt) -> float:
-    """Return the standard deviation of a reading of weight one in uT."""
-    return learnt.hyperparameters.noise
 
 
 @dataclass(frozen=True)

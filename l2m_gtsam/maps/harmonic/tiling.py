@@ -7,8 +7,6 @@ from itertools import pairwise
 import numpy as np
 from pydantic import Field
 from scipy.optimize import brentq
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FloatArray, IntArray
@@ -18,6 +16,7 @@ from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR
 from l2m_gtsam.maps.harmonic.tile_shares import TilePoints, shares_of
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
+from l2m_gtsam.solve.linear_algebra import parts_of
 
 # Modes per square metre of box and squared wave number: a quarter of a disc of half waves.
 MODE_DENSITY = 1 / (4 * np.pi)
@@ -160,8 +159,7 @@ class Tiling:
         """Number of parts of the survey that are further apart than a tile."""
         cells = self.grid.cells
         touching = cKDTree(cells).query_pairs(1.5, output_type="ndarray")
-        graph = coo_array((np.ones(len(touching)), tuple(touching.T)), shape=(len(cells),) * 2)
-        return int(connected_components(graph, directed=False)[0])
+        return int(parts_of(touching, len(cells)).max()) + 1
 
     def by_tile(self, points: FloatArray) -> list[TilePoints]:
         """Return which tiles have a share in which points; far from all of them the nearest has.

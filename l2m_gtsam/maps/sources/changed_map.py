@@ -5,8 +5,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from l2m_gtsam.data import FieldSample, FloatArray, IntArray
-from l2m_gtsam.maps.field_map import optional_members
+from l2m_gtsam.data import FieldAndGradient, FieldSample, FloatArray, IntArray
+from l2m_gtsam.maps.field_map import WrappedMap
 from l2m_gtsam.maps.sources.found_sources import FoundSources
 from l2m_gtsam.maps.sources.source import SourceShape
 
@@ -18,7 +18,7 @@ LOOSE = 10.0
 class SurveyedField(Protocol):
     """What a map is asked for that sources are added to."""
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient."""
 
     def query(self, points: FloatArray, /) -> FieldSample:
@@ -91,7 +91,7 @@ class ChangedErrors:
         return np.concatenate([of_map, self.of_sources.features(points)], axis=2)
 
 
-class ChangedMap:
+class ChangedMap(WrappedMap):
     """A map and sources beside it; in all else the map itself.
 
     Parameters
@@ -103,14 +103,8 @@ class ChangedMap:
     """
 
     def __init__(self, field_map: SurveyedField, found: FoundSources) -> None:
-        self._map: Any = field_map
+        super().__init__(field_map)
         self._found = found
-        vars(self).update(optional_members(field_map, self))
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "_map":  # before there is one, as when another process unpacks it
-            raise AttributeError(name)
-        return getattr(self._map, name)
 
     def __reduce__(self) -> tuple[type["ChangedMap"], tuple[SurveyedField, FoundSources]]:
         return ChangedMap, (self._map, self._found)
@@ -119,7 +113,7 @@ class ChangedMap:
         """Return the same over the form of the map that is asked faster."""
         return ChangedMap(self._map.compile(), self._found)
 
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray, /) -> FieldAndGradient:
         """Return field and gradient of both."""
         field, gradient = self._map.field_and_gradient(points)
         return self._with_sources(points, field, gradient)
@@ -136,7 +130,7 @@ class ChangedMap:
 
     def _with_sources(
         self, points: FloatArray, field: FloatArray, gradient: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> FieldAndGradient:
         for shape in self._found.shapes:
             b, G = shape.field_and_gradient(points)
             field, gradient = field + b, gradient + G

@@ -1,5 +1,6 @@
 """Sources with their covariance, fitted by damped Gauss-Newton steps."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -64,9 +65,12 @@ class FoundSources:
 
     def field(self, points: FloatArray) -> FloatArray:
         """Return the field of all of them in uT, shape (N, 3)."""
-        return sum(
-            (each.field_and_gradient(points)[0] for each in self.shapes), np.zeros_like(points)
-        )
+        return field_of(self.shapes, points)
+
+
+def field_of(shapes: Sequence[SourceShape], points: FloatArray) -> FloatArray:
+    """Return the field of sources at points, shape (N, 3), in metres, in microtesla, (N, 3)."""
+    return sum((each.field_and_gradient(points)[0] for each in shapes), np.zeros_like(points))
 
 
 def nothing_found(rows: MarginalRows) -> FoundSources:
@@ -164,10 +168,7 @@ class _State:
         cls, rows: MarginalRows, theta: FloatArray, free: BoolArray, prior: "SourcePrior"
     ) -> "_State":
         shapes = [SourceShape(each) for each in theta.reshape(-1, PARAMETERS)]
-        field = sum(
-            (s.field_and_gradient(rows.points)[0] for s in shapes), np.zeros_like(rows.points)
-        )
-        pulled, squared = rows.pull(rows.residual - field)
+        pulled, squared = rows.pull(rows.residual - field_of(shapes, rows.points))
         off = theta[free] - prior.mean
         cost = squared + float(prior.information @ off**2)
         return cls(rows, shapes, free, prior, off, pulled, cost)

@@ -18,7 +18,7 @@ from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.sparse import csr_array
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
-from l2m_gtsam.solve.row_blocks import RowBlocks
+from l2m_gtsam.solve.linear_algebra import RowBlocks
 
 AXES = 3
 ANYTHING_UT = 1e4  # that a wrong reading may be off by

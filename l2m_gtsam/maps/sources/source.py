@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray
 from l2m_gtsam.maps.harmonic.dipoles import SOFT, add_dipoles
 from l2m_gtsam.maps.harmonic.triangular import FAST
 
@@ -67,7 +67,7 @@ class SourceShape:
         """Whether it has a length."""
         return bool(self.half_axis.any())
 
-    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def field_and_gradient(self, points: FloatArray) -> FieldAndGradient:
         """Return the field in uT, (N, 3), and its gradient in uT/m, (N, 3, 3), at points in m."""
         s, w = self._nodes()
         field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))

@@ -34,7 +34,7 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     visits_among,
 )
 from l2m_gtsam.slam.unknown_field.visit_graph import POSE, VisitGraph, ways_between
-from l2m_gtsam.solve.row_blocks import RowBlocks
+from l2m_gtsam.solve.linear_algebra import RowBlocks
 
 KNOWN_M = 0.02  # standard deviation of a sensor's place, up to which tiles are judged
 MOST_CHANGED = 0.6  # share of the visits to known tiles, beyond which none is believed to have

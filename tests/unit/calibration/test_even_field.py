@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from l2m_gtsam.calibration.even_field import is_noise, shows_no_place
+from l2m_gtsam.calibration.explanation import is_noise, shows_no_place
 from l2m_gtsam.data import Readings
 from tests.drives.degenerate import COUNT, STRONG
 from tests.drives.verdict import EIGHT, SENSORS, read

@@ -12,7 +12,7 @@ from l2m_gtsam.calibration.stretch_causes import DisagreeingPlaces
 from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.records.places import Cause, clear_cause
-from l2m_gtsam.solve.row_blocks import RowBlocks
+from l2m_gtsam.solve.linear_algebra import RowBlocks
 
 NOISE_UT, SIZE_UT = 0.2, 3.0
 LAPS, SLOTS, SENSORS = 2, 240, 3

@@ -37,12 +37,11 @@ class Round:
 
     steps: dict[int, float]
     decrement: float = 0.0
-    tests: dict[int, Determinacy] = field(
-        default_factory=lambda: {0: rank_test(0), 1: rank_test(0)}
-    )
     noisy: frozenset[int] = frozenset()
     drive: Any = field(
-        default_factory=lambda: SimpleNamespace(view=SimpleNamespace(sensors=[0, 1]))
+        default_factory=lambda: SimpleNamespace(
+            view=SimpleNamespace(sensors=[0, 1]), tests={0: rank_test(0), 1: rank_test(0)}
+        )
     )
 
     def sigmas(self, sensor: int, _: object) -> float:

@@ -14,8 +14,7 @@ from l2m_gtsam.errors import Notice
 from l2m_gtsam.maps.harmonic import compiled, compiled_tile, tiles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import Learnt
-from l2m_gtsam.maps.harmonic.tile import Tile
-from l2m_gtsam.maps.harmonic.tiles import solved_tile
+from l2m_gtsam.maps.harmonic.tiles import Tile, solved_tile
 from l2m_gtsam.storage import tile_folder
 from l2m_gtsam.storage.tile_folder import TileFolder
 from tests.worlds.harmonic import OPTIONS, POST, fitted_map, queries, readings

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.kernel_sum import KernelSums
 from l2m_gtsam.maps.posterior import LEAST, exponentiate
+from l2m_gtsam.maps.sliding_gp import KernelSums
 from tests.support.central_differences import slopes
 
 LENGTH_SCALE = 0.7  # m

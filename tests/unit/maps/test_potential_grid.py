@@ -9,12 +9,13 @@ from hypothesis import strategies as st
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.potential_grid import (
+    DEGREE,
+    HALF_TAPS,
     Box,
     PotentialGrid,
     PotentialLattice,
     potential_grid,
 )
-from l2m_gtsam.maps.harmonic.spline import DEGREE, HALF_TAPS
 from tests.support.central_differences import slopes
 
 FIELD_TOLERANCE = 0.005  # uT, what the solvers are promised

@@ -15,7 +15,7 @@ from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic import error_modes
 from l2m_gtsam.maps.harmonic.error_modes import moved_weights
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.suite_found import shown
+from l2m_gtsam.maps.harmonic.suite_sizes import shown
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.maps.training import cubes_of, errors_together, merged, training_set
 from tests.worlds.harmonic import OPTIONS, POST, readings, within_survey

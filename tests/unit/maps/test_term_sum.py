@@ -5,13 +5,13 @@ import pytest
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis
-from l2m_gtsam.maps.harmonic.compiled_tile import TermSum, sources_of
+from l2m_gtsam.maps.harmonic.compiled_tile import TermSum
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.evidence import Weights
 from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
-from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tiles import Tile
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
 
@@ -54,7 +54,7 @@ def test_the_terms_add_up_to_the_basis(name: str) -> None:
     places = np.random.default_rng(2).uniform([-1, -1, -0.5], [6, 6, 2], (40, 3))
     # At a source and so near to one that its field is that at the distance where it is capped.
     places = np.concatenate([places, POSTS[0, :2], POSTS[1, :2] + 3e-4])
-    field, gradient = TermSum.of(tile, sources_of(tile)).field_and_gradient(places)
+    field, gradient = TermSum.of(tile).field_and_gradient(places)
     expected = basis.field_and_gradient(places, weights.mean)
     # Sums of hundreds of terms in another order; near a source its own dwarfs the others.
     for found, truth in ((field, expected[0]), (gradient, expected[1])):

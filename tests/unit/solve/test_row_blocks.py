@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.sources.marginal import ANYTHING_UT, MarginalRows
-from l2m_gtsam.solve.row_blocks import ROWS, RowBlocks
+from l2m_gtsam.solve.linear_algebra import ROWS, RowBlocks
 from tests.worlds.loop_rows import DIPOLE, loop_path, rows_with
 
 

@@ -13,7 +13,7 @@ from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.qa.metrics.coordinates import PARAMETERS
 from l2m_gtsam.records.places import CLEAR, WhatChanged
 from l2m_gtsam.records.validation import CalibrationPart
-from l2m_gtsam.solve.row_blocks import RowBlocks
+from l2m_gtsam.solve.linear_algebra import RowBlocks
 from l2m_gtsam.validation.places import (
     ANYTHING,
     PlaceOrVehicle,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.calibration.budget.looked_for import processes
-from l2m_gtsam.calibration.budget.moving_parts import (
+from l2m_gtsam.calibration.budget.looked_for import (
     MotionUnits,
     MovingParts,
     motion_numbers,
+    processes,
 )
 from l2m_gtsam.data import LidarMotion
 from l2m_gtsam.records.error_budget import DisturbanceKind

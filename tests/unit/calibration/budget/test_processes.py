@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_factors import PoseMotion, moved
-from l2m_gtsam.calibration.budget.clock import ClockDrift
 from l2m_gtsam.calibration.budget.found import spread_of_H
-from l2m_gtsam.calibration.budget.looked_for import processes
+from l2m_gtsam.calibration.budget.looked_for import ClockDrift, processes
 from l2m_gtsam.calibration.budget.processes import (
     LASTING_S,
     FieldProcess,

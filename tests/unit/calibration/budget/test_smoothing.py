@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.calibration.budget.looked_for import processes
+from l2m_gtsam.calibration.budget.looked_for import Smoothing, processes
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces, field_bend
-from l2m_gtsam.calibration.budget.smoothing import Smoothing
 from l2m_gtsam.data import FloatArray, Readings, Trajectory
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.error_budget import DisturbanceKind
