@@ -13,7 +13,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.map_queries import Survey, survey, warehouse
+from benchmarks.dipole_hall import Survey
+from benchmarks.map_queries import survey, warehouse, within
 from benchmarks.timing import seconds
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.field_map import FieldMap
@@ -41,7 +42,7 @@ class Maps:
 
 
 def open_floor() -> Maps:
-    return Maps.of(survey(warehouse()).within(HALF))
+    return Maps.of(within(survey(warehouse()), HALF))
 
 
 def hall_with_posts() -> Maps:
