@@ -11,7 +11,6 @@ from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.simulate.hall_drives import (
     LANE_M,
-    STEP_NS,
     calibration_drive,
     driven,
     survey,
@@ -159,8 +158,7 @@ def patrol(hall: SteelHall, seed: int) -> Trajectory:
     curve[:, :, along] = s
     curve[1::2, :, along] = s[::-1]
     curve[:, :, 1 - along] = across[:, None]
-    path = driven(hall, curve.reshape(-1, 2))
-    return Trajectory(STEP_NS * np.arange(len(path.p)), path.R, path.p, "map", "lidar")
+    return driven(hall, curve.reshape(-1, 2))
 
 
 def rounds_end(options: ChangesStudyOptions, seed: int, rounds: int) -> RoundsEnd:
