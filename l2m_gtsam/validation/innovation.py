@@ -114,6 +114,11 @@ class KnownCalibration:
     noise: float
     number_sigma: FloatArray
 
+    @property
+    def C(self) -> FloatArray:
+        """Distortion matrix, shape (3, 3)."""
+        return self.vector[3:12].reshape(3, 3)
+
     def estimate(self) -> Estimate:
         """Return it as an estimate of a single sensor."""
         return estimate_of(self.vector[None], np.array([self.noise]))

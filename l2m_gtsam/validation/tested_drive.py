@@ -13,10 +13,8 @@ from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.validation import CalibrationPart, NotValidated, ValidatedSensor
 from l2m_gtsam.validation.drive_test import DriveTest, tested
-from l2m_gtsam.validation.figures import offset_s
 from l2m_gtsam.validation.innovation import estimate_of, together
 from l2m_gtsam.validation.places import AveragedBesideMap, is_searched
-from l2m_gtsam.validation.recheck import inside, usable
 
 
 @dataclass(frozen=True)
@@ -108,15 +106,10 @@ class TestedDrive:
 
     def _counted(self) -> Iterator[tuple[Readings, BoolArray]]:
         """Yield the readings of each sensor that could be tested, and which of them count."""
-        options, field_map = self.test.options, self.test.field_map
-        searched = is_searched(field_map, options.changes)
+        searched = is_searched(self.test.field_map, self.test.options.changes)
         for each in self.calibrations:
-            drive, known = self.test.drive_of(each), self.test.known(each)
-            if searched:
-                counts = inside(drive, field_map, known)
-            else:
-                counts = usable(drive, field_map, known, options.solve)
-            yield drive.at(offset_s(each)), counts
+            drive = self.test.drive_of(each)
+            yield drive.timed, drive.inside() if searched else drive.usable()
 
 
 def parts_of(found: ValidatedSensor | NotValidated) -> tuple[CalibrationPart, ...]:
