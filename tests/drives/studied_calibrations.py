@@ -10,10 +10,11 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.data import FloatArray, joined_rows
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
-from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, hall_cloud, steel_hall
+from l2m_gtsam.simulate.steel_hall import MILD, SteelHall, steel_hall
 from l2m_gtsam.studies.honesty.cells import Outcomes
 from l2m_gtsam.studies.honesty.drives import drive_seed, start_near
 from l2m_gtsam.studies.honesty.summary import Consistency, consistency
+from tests.worlds.hall_clouds import CloudVariant, hall_cloud
 from tests.worlds.studied_maps import Build, Scene, StudiedMap
 
 START_M = 0.05  # each axis of a start is at most this far from the truth

@@ -17,9 +17,7 @@ from l2m_gtsam.simulate.hall_drives import (
 )
 from l2m_gtsam.simulate.steel_hall import (
     HALF_AREA,
-    CloudVariant,
     SteelHall,
-    hall_cloud,
     steel_hall,
 )
 from l2m_gtsam.studies.changes.loads import (
@@ -113,7 +111,7 @@ class Warehouse:
         """Return the map of a survey, with what a LiDAR sees."""
         o = self.options
         read = survey(self.hall, seed, o.heights, o.noise, o.survey_readings)
-        seen = hall_cloud(self.bare, CloudVariant.ACCURATE, self.seed)
+        seen = self.bare.cloud()
         loads = [surface(o, self.places[k]) for k in sorted(self.loads)]
         return build_map(read.points, read.field, o.map, np.concatenate([seen, *loads]))
 

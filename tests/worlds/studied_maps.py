@@ -15,12 +15,11 @@ from l2m_gtsam.simulate.steel_hall import (
     HALF_AREA,
     MILD,
     STRONG,
-    CloudVariant,
     SteelHall,
-    hall_cloud,
     steel_hall,
 )
 from l2m_gtsam.studies.statistics import inside_interval
+from tests.worlds.hall_clouds import CloudVariant, hall_cloud
 
 # Of a map's summary.
 NOISE_FACT, VERDICT_FACT = "noise of a reading (uT)", "field"

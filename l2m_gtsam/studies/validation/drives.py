@@ -23,7 +23,7 @@ from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, CalibrationDrive, calibration_drive, survey
-from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
+from l2m_gtsam.simulate.steel_hall import SteelHall, steel_hall
 from l2m_gtsam.simulate.world import SteelWorld, brought_steel, place_beside
 from l2m_gtsam.studies.honesty.drives import drive_seed
 
@@ -118,8 +118,7 @@ def calibrated_hall(options: ValidationStudyOptions, number: int) -> CalibratedH
     seed = options.seed + number
     hall = steel_hall(seed)
     read = survey(hall, seed, options.heights, options.noise, options.survey_readings)
-    cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
-    learnt = build_map(read.points, read.field, options.map, cloud)
+    learnt = build_map(read.points, read.field, options.map, hall.cloud())
     field_map = for_solvers(learnt)
     span = min(options.heights), max(options.heights)
     sensors = calibration_drive(hall, seed, span, options.noise, options.sensors, 30).sensors

@@ -10,14 +10,12 @@ from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, HallSurvey, calibration_
 from l2m_gtsam.simulate.steel_hall import (
     EARTH,
     HALF_AREA,
-    SHIFT_M,
     STRONG,
     VOXEL_M,
-    CloudVariant,
     SteelHall,
-    hall_cloud,
     steel_hall,
 )
+from tests.worlds.hall_clouds import SHIFT_M, CloudVariant, hall_cloud
 from tests.worlds.studied_maps import held_out
 
 SEEDS = [0, 1, 2]
