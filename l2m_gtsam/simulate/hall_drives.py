@@ -37,21 +37,10 @@ class HallSurvey:
         Places in metres, shape (N, 3).
     field
         Readings in uT, shape (N, 3).
-    heights
-        Of its passes over the floor, in metres.
-    noise
-        Standard deviation of the readings' noise per axis in uT.
     """
 
     points: FloatArray
     field: FloatArray
-    heights: tuple[float, ...]
-    noise: float
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """Lowest and highest pass in metres."""
-        return min(self.heights), max(self.heights)
 
 
 @dataclass(frozen=True)
@@ -156,7 +145,7 @@ def survey(
     points = np.concatenate(passes)
     points = points[hall.free(points, CLEARANCE_M)]
     field = hall.world.field(points) + noise * rng.standard_normal(points.shape)
-    return HallSurvey(points, field, heights, noise)
+    return HallSurvey(points, field)
 
 
 def calibration_drive(

@@ -185,7 +185,7 @@ def _outcomes(
         hall = steel_hall(seed, conditions.strength)
         surveyed = survey(hall, seed, heights, noise, conditions.survey_readings)
         field_map = case.build(Scene(surveyed, hall_cloud(hall, case.cloud, seed), hall))
-        span = conditions.sensor_span or surveyed.span
+        span = conditions.sensor_span or (min(heights), max(heights))
         for number, drive in enumerate(_drives(hall, conditions, seed, span, noise)):
             start = start_near(drive, seed, number, START_M)
             for method, calibrate in case.methods.items():
@@ -227,7 +227,7 @@ def _row(
     wanted: int,
 ) -> CalibrationRow:
     """Return the figures of a method under one condition."""
-    determined = outcomes.determined()
+    determined = outcomes[outcomes.determined_rows()]
     enough = determined.enough
     variances = np.diagonal(determined.covariance, axis1=1, axis2=2)
     blocks = determined.blocks

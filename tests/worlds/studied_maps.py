@@ -238,7 +238,7 @@ def predict(
     hall = steel_hall(world, strength)
     surveyed = survey(hall, world, heights, conditions.noise, conditions.readings)
     field_map = build(Scene(surveyed, hall_cloud(hall, cloud, world), hall))
-    low, high = surveyed.span
+    low, high = min(heights), max(heights)
     truth = held_out(hall, world, (low - conditions.off_plane, high + conditions.off_plane))
     sample = field_map.query(truth.points)
     error = (sample.field - truth.field)[sample.inside]

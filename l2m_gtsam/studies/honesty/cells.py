@@ -58,10 +58,6 @@ class Outcomes:
         finite = np.isfinite(self.covariance[:, :15, :15]).all(axis=(1, 2))
         return np.flatnonzero(finite & np.isfinite(self.error).all(axis=1))
 
-    def determined(self) -> "Outcomes":
-        """Return those of which t, C and H have a result and a finite variance."""
-        return self[self.determined_rows()]
-
     @property
     def blocks(self) -> dict[str, slice]:
         """Parameters to judge together by name; the time offset where all of these know it."""

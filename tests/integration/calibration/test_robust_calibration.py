@@ -43,7 +43,7 @@ def place(
     data = survey(hall, seed, noise=NOISE)
     cloud = hall.cloud()
     field_map = HarmonicMap.fit(data.points, data.field, options, cloud=cloud)
-    drive = calibration_drive(hall, seed, data.span, NOISE, sensors=sensors, count=count)
+    drive = calibration_drive(hall, seed, (0.4, 1.0), NOISE, sensors=sensors, count=count)
     return Place(field_map.compile(), drive)
 
 
