@@ -62,11 +62,10 @@ def magyc_python() -> Path:
     """
     python = Path(os.environ.get(PYTHON_VARIABLE, PYTHON))
     if not python.is_file():
-        msg = (
+        raise PeerError(
             f"magyc has no environment at {python}: run `make magyc`, or name its Python in "
             f"{PYTHON_VARIABLE}"
         )
-        raise PeerError(msg)
     # The link in bin/ is what makes it that environment: never resolved.
     return python.absolute()
 
@@ -104,8 +103,7 @@ def _arrays(drives: Sequence[ChipDrive]) -> dict[str, FloatArray]:
     for index, each in enumerate(drives):
         readings, motion = each.readings, each.readings.motion
         if motion is None:
-            msg = f"magyc needs turn rates: the readings of drive {index} have no motion"
-            raise PeerError(msg)
+            raise PeerError(f"magyc needs turn rates: the readings of drive {index} have no motion")
         arrays[f"field_{index}"] = readings.field / GAUSS
         arrays[f"rate_{index}"] = motion.twist_lidar[:, :3] @ each.R_mag_lidar.T
         arrays[f"time_{index}"] = (readings.stamp_ns - readings.stamp_ns[:1]) * 1e-9

@@ -127,12 +127,11 @@ def _near(survey: TrainingSet, path: FloatArray, options: NaiveOptions) -> IntAr
     distance, _ = cKDTree(path).query(survey.points)
     rows = np.flatnonzero(distance <= options.reach)
     if len(rows) < FEWEST:
-        msg = (
+        raise MapError(
             f"naive peer: {len(rows)} of {len(survey)} survey readings lie within "
             f"{options.reach:g} m of the drive, {FEWEST} are needed: survey where it drives, or "
             "set a wider reach"
         )
-        raise MapError(msg)
     rows = np.random.default_rng(options.seed).permutation(rows)
     cubes = np.floor(survey.points[rows] / options.spacing).astype(np.int64)
     _, first = np.unique(cubes, axis=0, return_index=True)

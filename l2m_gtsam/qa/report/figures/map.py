@@ -235,11 +235,10 @@ def map_figure(field_map: FieldMap, height: float | None) -> Figure:
     level = float(lower[2] + upper[2]) / 2 if height is None else height
     cut = slice_map(field_map, lower[:2], upper[:2], level, CELLS)
     if not np.isfinite(cut.strength).any():
-        msg = (
+        raise MapError(
             f"the map has no data at z = {level:g} m, its readings run from {lower[2]:.2f} to "
             f"{upper[2]:.2f} m"
         )
-        raise MapError(msg)
     diary = field_map.diary if isinstance(field_map, Remembering) else None
     wide_enough = 12 if diary is None else 17
     figure = Figure(figsize=(wide_enough, 5), layout="constrained", dpi=130)
