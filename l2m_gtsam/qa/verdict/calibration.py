@@ -1,7 +1,7 @@
 """The verdict on a calibration: PASS, WARN or FAIL, with reasons in plain sentences."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -320,7 +320,7 @@ class Measured:
     value: float
     warn: float
     fail: float
-    passes: str = ""
+    passes: str
 
     @property
     def level(self) -> Level:
@@ -344,31 +344,25 @@ def measured(
     turned = np.rad2deg(np.sqrt(np.diag(sensor.rotation_covariance)))
     chi2 = np.nan if sensor.residuals is None else sensor.residuals.chi2_per_dof
     apart, passes = furthest_shown(found.halves, options)
+    outside = _share(sensor.outside_map, sensor.inside + sensor.outside_map)
     every = (
         _in("sigma of t", "mm", _largest(sensor.t_sigma), options.position_sigma_m, 1e3),
         _in("sigma of rotation", "°", _largest(turned), options.rotation_sigma_deg),
         _in("sigma of H", "µT", _largest(sensor.H_sigma), options.hard_iron_sigma_ut),
         _in("unexplained by the map", "", found.fit.unexplained, options.unexplained),
         _in("chi-square", "", chi2, options.chi_square),
-        replace(
-            _in("halves apart, over what chance allows", "", apart, options.halves_apart),
-            passes=passes,
-        ),
+        _in("halves apart, over what chance allows", "", apart, options.halves_apart, 1.0, passes),
         _in("rejected", "%", _share(sensor.rejected, sensor.inside), options.rejected, 100),
-        _in(
-            "outside the map",
-            "%",
-            _share(sensor.outside_map, sensor.inside + sensor.outside_map),
-            options.outside_map,
-            100,
-        ),
+        _in("outside the map", "%", outside, options.outside_map, 100),
         _in("beyond the range", "%", _beyond_range(sensor), options.saturated, 100),
     )
     return tuple(each for each in every if not np.isnan(each.value))
 
 
-def _in(name: str, unit: str, value: float, limit: Limit, factor: float = 1.0) -> Measured:
-    return Measured(name, unit, factor * value, factor * limit.warn, factor * limit.fail)
+def _in(
+    name: str, unit: str, value: float, limit: Limit, factor: float = 1.0, passes: str = ""
+) -> Measured:
+    return Measured(name, unit, factor * value, factor * limit.warn, factor * limit.fail, passes)
 
 
 def _largest(sigmas: FloatArray) -> float:
