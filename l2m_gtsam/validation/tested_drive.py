@@ -7,7 +7,6 @@ from itertools import compress
 
 import numpy as np
 
-from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.data import BoolArray, Readings
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.records.calibration import SensorCalibration
@@ -85,15 +84,10 @@ class TestedDrive:
         """The averaged drive if places are suspected on it, or sensors changed."""
         if not self.sensors:
             return None
-        given = self.test.field_map, self._estimate, self.test.options.changes
+        estimate = estimate_of([self.test.known(each) for each in self.calibrations])
+        given = self.test.field_map, estimate, self.test.options.changes
         averages = AveragedBesideMap.of(self._readings, *given)
         return averages if len(averages.places) or self.changed else None
-
-    @property
-    def _estimate(self) -> Estimate:
-        known = [self.test.known(each) for each in self.calibrations]
-        vectors = np.array([each.vector for each in known])
-        return estimate_of(vectors, np.array([each.noise for each in known]))
 
     @property
     def _readings(self) -> Readings:

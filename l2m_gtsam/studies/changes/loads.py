@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
-from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.data import FloatArray, KnownSensor, joined_rows
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.simulate.hall_drives import calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import (
@@ -166,11 +166,5 @@ def outside(options: ChangesStudyOptions, rng: np.random.Generator) -> FloatArra
 
 def joined(world: SteelWorld, other: SteelWorld) -> SteelWorld:
     """Return a world with the bodies of another, in the field of the first."""
-    return SteelWorld(
-        world.kinds + other.kinds,
-        np.concatenate([world.dimensions, other.dimensions]),
-        np.concatenate([world.centres, other.centres]),
-        np.concatenate([world.R_map_body, other.R_map_body]),
-        np.concatenate([world.polarisations, other.polarisations]),
-        world.earth,
-    )
+    whole = joined_rows([world, other])
+    return replace(whole, kinds=world.kinds + other.kinds, earth=world.earth)

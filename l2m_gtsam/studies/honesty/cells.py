@@ -20,7 +20,7 @@ from l2m_gtsam.studies.honesty.drives import (
 )
 from l2m_gtsam.studies.json_arrays import JsonFloats
 from l2m_gtsam.studies.methods import bound_at
-from l2m_gtsam.validation.innovation import estimate_of
+from l2m_gtsam.validation.innovation import KnownCalibration, estimate_of
 
 PARAMETERS = 16
 OFFSET = slice(15, 16)
@@ -161,6 +161,5 @@ def bound_of(hall: MappedHall, disturbed: Disturbed, options: OneKeyOptions) -> 
     readings = drive.readings.select(disturbed.change == 0)
     if readings.motion is not None:
         readings = with_offsets(readings, drive.trajectory, drive.offset)
-    vectors = drive.truth()
-    truth = estimate_of(vectors, np.full(len(vectors), hall.noise))
-    return bound_at(readings, hall.field_map, truth, options)
+    known = [KnownCalibration(each, hall.noise, np.zeros((0, 3))) for each in drive.truth()]
+    return bound_at(readings, hall.field_map, estimate_of(known), options)
