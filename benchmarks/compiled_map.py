@@ -13,14 +13,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.map_queries import Survey, survey, warehouse
+from benchmarks.dipole_hall import Survey
+from benchmarks.map_queries import survey, warehouse, within
 from benchmarks.timing import seconds
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.maps.sliding_gp import SlidingGP
 from l2m_gtsam.simulate import hall_drives
-from l2m_gtsam.simulate.steel_hall import STRONG, CloudVariant, hall_cloud, steel_hall
+from l2m_gtsam.simulate.steel_hall import STRONG, steel_hall
 
 HALF = 5.0  # metres: of the part of the open floor
 FEW, MANY = 3_000, 100_000  # places
@@ -41,14 +42,13 @@ class Maps:
 
 
 def open_floor() -> Maps:
-    return Maps.of(survey(warehouse()).within(HALF))
+    return Maps.of(within(survey(warehouse()), HALF))
 
 
 def hall_with_posts() -> Maps:
     hall = steel_hall(3, STRONG)
     data = hall_drives.survey(hall, 3)
-    cloud = hall_cloud(hall, CloudVariant.ACCURATE, 3)
-    return Maps.of(Survey(data.points, data.field), cloud)
+    return Maps.of(Survey(data.points, data.field), hall.cloud())
 
 
 def places(exact: HarmonicMap, count: int) -> FloatArray:

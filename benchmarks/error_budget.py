@@ -11,9 +11,9 @@ from time import process_time
 
 import numpy as np
 
+from benchmarks.dipole_hall import compiled_map, hall, true_start
 from benchmarks.last_stage import laps
-from benchmarks.one_key import NOISE, hall, survey
-from l2m_gtsam.calibration.alternation import Alternated, OneKeyOptions, start_estimate
+from l2m_gtsam.calibration.alternation import Alternated, OneKeyOptions
 from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.one_key import settle, solve_one_key
 from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
@@ -22,7 +22,7 @@ from l2m_gtsam.calibration.uncertain_graph import IndependentOptimum, UncertainD
 from l2m_gtsam.calibration.uncertain_rounds import settle_by_any
 from l2m_gtsam.calibration.view import RememberedMap, StandIns
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
+from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import silent
 from tests.worlds.exact import random_sensors
@@ -91,13 +91,7 @@ def misplaced(readings: Readings) -> Readings:
 
 def cost(field_map: CompiledMap, readings: Readings) -> Cost:
     """Return what the last graph costs."""
-    sensors = random_sensors(1, SENSORS)
-    start = start_estimate(np.stack([s.t_lidar_mag for s in sensors]), OPTIONS)
-    start = replace(
-        start,
-        distortion=np.stack([s.distortion.vector() for s in sensors]),
-        noise=np.full(SENSORS, NOISE),
-    )
+    start = true_start(random_sensors(1, SENSORS), OPTIONS)
     asked = RememberedMap(field_map)
     near, few = Alternated(start, start.t, steps=0), StandIns.of(readings, OPTIONS.fewer_readings)
     joint = settle(readings, few, asked, near, OPTIONS, silent, None)
@@ -124,8 +118,7 @@ def cost(field_map: CompiledMap, readings: Readings) -> Cost:
 @one_blas_thread()
 def main() -> None:
     """Print a line for each drive."""
-    data = survey(hall(1), 8000)
-    field_map = HarmonicMap.fit(data.points, data.field).compile()
+    field_map = compiled_map(hall(1))
     clean = laps(random_sensors(1, SENSORS), hall(1), EACH)
     print(f"{SENSORS} x {EACH}: seconds without, with, ratio")
     print(f"{'':>10} {'last graph':>21}   {'solve':>21}   {'starts and solve':>21}   found")

@@ -12,11 +12,10 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.one_key import NOISE, hall, survey
+from benchmarks.dipole_hall import compiled_map, hall, read_together, true_start
 from benchmarks.timing import seconds
 from l2m_factors import map_weights_prior
-from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
-from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.optimise import LinearSolver
 from l2m_gtsam.calibration.uncertain_graph import (
@@ -28,7 +27,7 @@ from l2m_gtsam.calibration.uncertain_graph import (
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
-from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
+from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from tests.reference.elimination import Eliminated, eliminate
 from tests.worlds.exact import DipoleWorld, random_sensors
@@ -89,17 +88,8 @@ def laps(sensors: tuple[KnownSensor, ...], world: DipoleWorld, count: int) -> Re
         [5 * phase + np.sin(7 * phase), 0.15 * np.sin(13 * phase), 0.15 * np.cos(9 * phase)]
     )
     R = Rotation.from_euler("ZYX", angles).as_matrix()
-    rng, fields = np.random.default_rng(3), []
-    for known in sensors:
-        B, _ = world.field_and_gradient(R @ known.t_lidar_mag + p)
-        b = np.einsum("nji,nj->ni", R, B)
-        fields.append(known.distortion.apply(b) + rng.normal(0, NOISE, b.shape))
-    n = len(sensors)
-    stamps = np.tile(np.linspace(0, 100e9, count).astype(np.int64), n)
-    sensor = np.repeat(np.arange(n), count)
-    poses = np.tile(R, (n, 1, 1)), np.tile(p, (n, 1))
-    names = tuple(known.sensor for known in sensors)
-    return Readings(names, sensor, stamps, *poses, np.concatenate(fields))
+    stamps = np.linspace(0, 100e9, count).astype(np.int64)
+    return read_together(sensors, world, R, p, stamps, seed=3)
 
 
 def case(field_map: CompiledMap, count: int, each: int) -> Case:
@@ -108,9 +98,7 @@ def case(field_map: CompiledMap, count: int, each: int) -> Case:
     readings = laps(sensors, world, each)
     root = np.diag(np.repeat(POSE_SIGMA, 3))
     readings = replace(readings, pose_root=np.broadcast_to(root, (len(readings), 6, 6)))
-    start = start_estimate(np.stack([s.t_lidar_mag for s in sensors]), OPTIONS)
-    truth = np.stack([s.distortion.vector() for s in sensors])
-    estimate: Estimate = replace(start, distortion=truth, noise=np.full(count, NOISE))
+    estimate = true_start(sensors, OPTIONS)
     view = observe(readings, field_map, estimate, OPTIONS.min_readings)
     tests = joint_problem(view, field_map, estimate, OPTIONS).determinacies
     optimum = IndependentOptimum(view, field_map, field_map, estimate, tests, OPTIONS)
@@ -145,8 +133,7 @@ def row(field_map: CompiledMap, count: int, each: int) -> str:
 @one_blas_thread()
 def main() -> None:
     """Print a line as soon as there is one: the old engine takes minutes for 48 sensors."""
-    data = survey(hall(1), 8000)
-    field_map = HarmonicMap.fit(data.points, data.field).compile()
+    field_map = compiled_map(hall(1))
     print("    readings  weights    old (s)  new (s)  ratio   old cov (s)  new (s)  ratio")
     for count, each in GROWTH:
         print(row(field_map, count, each), flush=True)

@@ -10,7 +10,6 @@ On matrices of this size BLAS threads gain little on idle cores and lose much on
 OPENBLAS_NUM_THREADS=1 is the setting to compare figures with.
 """
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -19,6 +18,7 @@ from rich.table import Table
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
+from benchmarks.dipole_hall import Survey
 from benchmarks.timing import seconds
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import map_from_state
@@ -33,17 +33,10 @@ PEER_READINGS = 2_000
 NOISE = 0.1  # uT
 
 
-@dataclass(frozen=True)
-class Survey:
-    """Readings of a survey, positions in metres and fields in uT, shape (N, 3)."""
-
-    points: FloatArray
-    field: FloatArray
-
-    def within(self, half: float) -> "Survey":
-        """Return the part in a square of this half-width about the middle."""
-        keep = np.abs(self.points[:, :2] - SIZE / 2).max(axis=1) < half
-        return Survey(self.points[keep], self.field[keep])
+def within(data: Survey, half: float) -> Survey:
+    """Return the part in a square of this half-width about the middle."""
+    keep = np.abs(data.points[:, :2] - SIZE / 2).max(axis=1) < half
+    return Survey(data.points[keep], data.field[keep])
 
 
 def warehouse() -> DipoleWorld:
@@ -127,7 +120,7 @@ def peer_gradient(peer: GaussianProcessRegressor, points: FloatArray) -> FloatAr
 def against_the_peer(data: Survey, found: KernelHyperparameters) -> Table:
     """Return times of both on the same part of the survey, and how far they differ."""
     half = float(np.sqrt(PEER_READINGS / READINGS * SIZE.prod()) / 2)
-    part = data.within(half)
+    part = within(data, half)
     options = SlidingGPOptions(hyperparameters=found, thinning=ThinningOptions(spacing=0))
     ours = SlidingGP.fit(part.points, part.field, options)
     mean = part.field.mean(axis=0)

@@ -6,11 +6,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.one_key import NOISE, hall, survey
+from benchmarks.dipole_hall import NOISE, compiled_map, hall
 from benchmarks.timing import seconds
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
-from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.records.calibration import Uncertainty
 from tests.worlds.exact import drive, random_sensors
 
@@ -21,8 +20,7 @@ SIZES = (500, 2_000, 4_000)  # readings of each sensor
 def report() -> Table:
     """Return the costs of both, and how large the map makes the errors of t."""
     world, sensors = hall(1), random_sensors(1, SENSORS)
-    data = survey(world, 8000)
-    field_map = HarmonicMap.fit(data.points, data.field).compile()
+    field_map = compiled_map(world)
     table = Table("readings", "independent (s)", "full (s)", "full costs", "sigma of t grows by")
     for size in SIZES:
         readings = drive(2, sensors, world, count=size, noise=NOISE)

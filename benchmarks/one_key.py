@@ -6,6 +6,7 @@ readings and the same hyperparameters. Its answer is another by as much as it we
 otherwise, which the last table shows step by step.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,41 +18,16 @@ from scipy.optimize import least_squares
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
+from benchmarks.dipole_hall import NOISE, Survey, hall, survey
 from benchmarks.timing import seconds
 from l2m_factors import BatchedReadings, D, MagneticReadings, T, block_factor, reading_factor
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.view import observe
-from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.maps.sliding_gp import SlidingGP
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
-from tests.worlds.exact import DipoleWorld, drive, random_sensors
-
-NOISE = 0.1  # uT, of the survey and of the sensors
-
-
-@dataclass(frozen=True)
-class Survey:
-    """Readings of a map survey, positions in metres and fields in uT, shape (N, 3)."""
-
-    points: FloatArray
-    field: FloatArray
-
-
-def hall(seed: int) -> DipoleWorld:
-    """Return a hall with steel 1.5 m under its floor and 3 m above it: a few uT, well mapped."""
-    rng = np.random.default_rng(seed)
-    positions = rng.uniform([-8, -8, 0], [8, 8, 0], (60, 3))
-    positions[:, 2] = np.where(np.arange(60) % 2 == 0, -1.5, 3.0)
-    return DipoleWorld(np.array([22.0, 3.0, -38.0]), positions, rng.normal(0, 120, (60, 3)))
-
-
-def survey(world: DipoleWorld, count: int) -> Survey:
-    """Return readings in the volume that the drives of the benchmark pass."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-5.5, -5.5, -0.6], [5.5, 5.5, 1.6], (count, 3))
-    field, _ = world.field_and_gradient(points)
-    return Survey(points, field + rng.normal(0, NOISE, field.shape))
+from tests.worlds.exact import drive, random_sensors
 
 
 def factor_costs() -> Table:
@@ -105,50 +81,57 @@ def growth() -> Table:
     return table
 
 
+def one_sensor() -> tuple[KnownSensor, Readings, Survey, SlidingGP]:
+    """Return a sensor, 2,000 readings of it, and a survey of 3,000 with our map of it."""
+    world, sensors = hall(2), random_sensors(2, 1)
+    data, readings = survey(world, 3000), drive(3, sensors, world, count=2000, noise=NOISE)
+    return sensors[0], readings, data, SlidingGP.fit(data.points, data.field)
+
+
 @dataclass(frozen=True)
-class ShiftedRegressor:
-    """A regressor of deviations from a mean: scikit-learn's process itself has mean zero."""
+class NaiveMap:
+    """A regressor of deviations from the mean per axis: scikit-learn's process has mean zero."""
 
-    deviations: GaussianProcessRegressor
-    mean: float
+    axes: tuple[GaussianProcessRegressor, ...]
+    mean: FloatArray
 
-    def predict(self, points: FloatArray) -> FloatArray:
-        return np.asarray(self.deviations.predict(points) + self.mean)
+    @classmethod
+    def of(cls, data: Survey, field_map: SlidingGP) -> "NaiveMap":
+        """Fit a survey with the hyperparameters that our map has learnt."""
+        h = field_map.trained.hyperparameters
+        kernel = ConstantKernel(h.signal**2) * RBF(h.length_scale)
+        peers = [GaussianProcessRegressor(kernel, alpha=h.noise**2, optimizer=None) for _ in "xyz"]
+        mean = np.array([column.mean() for column in data.field.T])
+        axes = zip(peers, (data.field - mean).T, strict=True)
+        return cls(tuple(peer.fit(data.points, column) for peer, column in axes), mean)
+
+    def field(self, points: FloatArray) -> FloatArray:
+        """Return the field at points, shape (N, 3)."""
+        return np.column_stack([axis.predict(points) for axis in self.axes]) + self.mean
 
 
-def naive_solution(readings: Readings, axes: list[ShiftedRegressor]) -> FloatArray:
-    """Return (t, C, H) of one sensor as the peer finds it."""
+def least_squares_solution(
+    readings: Readings, field: Callable[[FloatArray], FloatArray], W: FloatArray
+) -> FloatArray:
+    """Return (t, C, H) of one sensor as the peer finds it in a field.
+
+    ``W`` is what residuals are multiplied with, shape (N, 3, 3).
+    """
     R, p, z = readings.R_map_lidar, readings.p_map_lidar, readings.field
 
     def residual(x: FloatArray) -> FloatArray:
-        points = R @ x[:3] + p
-        B = np.column_stack([axis.predict(points) for axis in axes])
-        b = np.einsum("nji,nj->ni", R, B)
-        return np.asarray((b @ x[3:12].reshape(3, 3).T + x[12:] - z).ravel())
+        b = np.einsum("nji,nj->ni", R, field(R @ x[:3] + p))
+        e = b @ x[3:12].reshape(3, 3).T + x[12:] - z
+        return np.asarray(np.einsum("nij,nj->ni", W, e).ravel())
 
     start = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
     return np.asarray(least_squares(residual, start).x)
 
 
-def naive_map(data: Survey, field_map: SlidingGP) -> list[ShiftedRegressor]:
-    """Return one regressor per axis with the hyperparameters that our map has learnt."""
-    h = field_map.trained.hyperparameters
-    kernel = ConstantKernel(h.signal**2) * RBF(h.length_scale)
-    axes = []
-    for column in data.field.T:
-        peer = GaussianProcessRegressor(kernel, alpha=h.noise**2, optimizer=None)
-        mean = float(column.mean())
-        axes.append(ShiftedRegressor(peer.fit(data.points, column - mean), mean))
-    return axes
-
-
 def against_the_peer() -> Table:
-    """Solve one sensor of 2,000 readings over a map of 3,000 survey readings."""
-    world, sensors = hall(2), random_sensors(2, 1)
-    data = survey(world, 3000)
-    readings = drive(3, sensors, world, count=2000, noise=NOISE)
-    field_map = SlidingGP.fit(data.points, data.field)
-    axes = naive_map(data, field_map)
+    """Solve one sensor on our map and on the peer's."""
+    sensor, readings, data, field_map = one_sensor()
+    peer, equal = NaiveMap.of(data, field_map), np.broadcast_to(np.eye(3), (len(readings), 3, 3))
     ours: list[FloatArray] = []
     peers: list[FloatArray] = []
 
@@ -157,40 +140,19 @@ def against_the_peer() -> Table:
         ours.append(solution.estimate.vector(0))
 
     fast = seconds(solve)
-    slow = seconds(lambda: peers.append(naive_solution(readings, axes)), 1)
+    slow = seconds(lambda: peers.append(least_squares_solution(readings, peer.field, equal)), 1)
     table = Table("one sensor, 2,000 readings, map of 3,000", "s", "|error of t| (mm)")
     for name, cost, answer in (("l2m_gtsam", fast, ours), ("scikit-learn + scipy", slow, peers)):
-        error = np.linalg.norm(answer[-1][:3] - sensors[0].t_lidar_mag) * 1e3
+        error = np.linalg.norm(answer[-1][:3] - sensor.t_lidar_mag) * 1e3
         table.add_row(name, f"{cost:.2f}", f"{error:.1f}")
     apart = np.linalg.norm(ours[-1][:3] - peers[-1][:3]) * 1e3
     table.add_row("ratio", f"{slow / fast:.0f}", f"answers {apart:.1f} mm apart")
     return table
 
 
-def weighted_solution(readings: Readings, field_map: SlidingGP, W: FloatArray) -> FloatArray:
-    """Return (t, C, H) of one sensor by the peer's least squares on our map.
-
-    ``W`` is what residuals are multiplied with, in 1/uT, shape (N, 3, 3).
-    """
-    R, p, z = readings.R_map_lidar, readings.p_map_lidar, readings.field
-
-    def residual(x: FloatArray) -> FloatArray:
-        B, _ = field_map.field_and_gradient(R @ x[:3] + p)
-        b = np.einsum("nji,nj->ni", R, B)
-        e = b @ x[3:12].reshape(3, 3).T + x[12:] - z
-        return np.asarray(np.einsum("nij,nj->ni", W, e).ravel())
-
-    start = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
-    return np.asarray(least_squares(residual, start).x)
-
-
 def from_ours_to_the_peers() -> Table:
     """Change our problem into the peer's step by step; the last step is another map."""
-    world, sensors = hall(2), random_sensors(2, 1)
-    data = survey(world, 3000)
-    readings = drive(3, sensors, world, count=2000, noise=NOISE)
-    field_map = SlidingGP.fit(data.points, data.field)
-    options = OneKeyOptions()
+    (sensor, readings, _, field_map), options = one_sensor(), OneKeyOptions()
     solution = solve_one_key(readings, field_map, np.zeros((1, 3)), options)
     estimate, used = solution.estimate, solution.used
     variance = observe(readings, field_map, estimate, options.min_readings).map_variance
@@ -205,8 +167,10 @@ def from_ours_to_the_peers() -> Table:
     }
     table = Table("least squares on our map", "from ours (mm)", "|error of t| (mm)")
     for name, (chosen, weights) in forms.items():
-        t = weighted_solution(chosen, field_map, weights)[:3]
-        apart, error = t - estimate.t[0], t - sensors[0].t_lidar_mag
+        found = least_squares_solution(
+            chosen, lambda x: field_map.field_and_gradient(x)[0], weights
+        )
+        apart, error = found[:3] - estimate.t[0], found[:3] - sensor.t_lidar_mag
         table.add_row(name, *(f"{np.linalg.norm(each) * 1e3:.3f}" for each in (apart, error)))
     return table
 

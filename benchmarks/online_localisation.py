@@ -13,11 +13,10 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from benchmarks.dipole_hall import NOISE, compiled_map, hall
 from benchmarks.memory import peak_mib
-from benchmarks.one_key import NOISE, hall, survey
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Trajectory
-from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.slam.online.follower import SECTION, Follower
 from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.slam.options import DriftOptions
@@ -83,8 +82,7 @@ def followed(drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: in
 
 def report() -> Table:
     world, sensors = hall(1), random_sensors(1, SENSORS)
-    data = survey(world, 8000)
-    field_map = HarmonicMap.fit(data.points, data.field).compile()
+    field_map = compiled_map(world)
     drawn = partial(drawn_drive, world, sensors, rng=np.random.default_rng(5), noise=NOISE)
     table = Table(
         "calibration", "graph", "key poses", "times real time", "ms per key pose: first tenth",

@@ -120,24 +120,15 @@ def by_sensor(rows: Sequence[FleetRow]) -> dict[tuple[str, str], list[int]]:
 def parameters(sensors: Sequence[SensorRow], options: FleetOptions) -> list[Parameter]:
     """Return what is compared from drive to drive: position, rotation and H."""
     turned = rotations_apart(np.array([each.quaternion_xyzw for each in sensors]))
+    t, t_sigma = (1e3 * _column(sensors, name) for name in ("t", "t_sigma"))
+    H, H_sigma = (_column(sensors, name) for name in ("H", "H_sigma"))
     parts = (
-        (
-            "t",
-            "mm",
-            1e3 * _column(sensors, "t"),
-            1e3 * _column(sensors, "t_sigma"),
-            options.least_m,
-        ),
+        ("t", "mm", t, t_sigma, 1e3 * options.least_m),
         ("rotation", "deg", turned, _column(sensors, "rotation_sigma"), options.least_deg),
-        ("H", "uT", _column(sensors, "H"), _column(sensors, "H_sigma"), options.least_ut),
+        ("H", "uT", H, H_sigma, options.least_ut),
     )
     return [
-        Parameter(
-            f"{name}_{axis} ({unit})",
-            value[:, k],
-            sigma[:, k],
-            least * (1e3 if unit == "mm" else 1),
-        )
+        Parameter(f"{name}_{axis} ({unit})", value[:, k], sigma[:, k], least)
         for name, unit, value, sigma, least in parts
         for k, axis in enumerate("xyz")
     ]

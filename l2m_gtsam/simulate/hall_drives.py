@@ -1,11 +1,23 @@
 """Surveys, held-out places and calibration drives on the free floor of a steel hall."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import Distortion, FloatArray, IntArray, KnownSensor, Readings, Trajectory
+from l2m_gtsam.data import (
+    BoolArray,
+    Distortion,
+    FieldSeries,
+    FloatArray,
+    KnownSensor,
+    Readings,
+    Recording,
+    SourceFile,
+    Trajectory,
+)
 from l2m_gtsam.simulate.steel_hall import HALF_AREA, SteelHall
 
 CLEARANCE_M = 0.4  # of every reading to posts and racks, horizontally
@@ -25,21 +37,10 @@ class HallSurvey:
         Places in metres, shape (N, 3).
     field
         Readings in uT, shape (N, 3).
-    heights
-        Of its passes over the floor, in metres.
-    noise
-        Standard deviation of the readings' noise per axis in uT.
     """
 
     points: FloatArray
     field: FloatArray
-    heights: tuple[float, ...]
-    noise: float
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """Lowest and highest pass in metres."""
-        return min(self.heights), max(self.heights)
 
 
 @dataclass(frozen=True)
@@ -63,21 +64,67 @@ class CalibrationDrive:
     trajectory: Trajectory
     offset: FloatArray
 
+    @classmethod
+    def along(
+        cls,
+        poses: Trajectory,
+        sensors: tuple[KnownSensor, ...],
+        free: Callable[[FloatArray], BoolArray],
+        field: Callable[[FloatArray], FloatArray],
+        noise: float,
+        count: int,
+        rng: np.random.Generator,
+    ) -> "CalibrationDrive":
+        """Return what sensors read on a path.
+
+        Parameters
+        ----------
+        poses
+            Of the lidar in the map.
+        sensors
+            With their true distortions.
+        free, field
+            Which places of the map, shape (N, 3) in metres, a sensor can be at, and the field there
+            in uT, shape (N, 3).
+        noise
+            Standard deviation of a reading per axis in uT.
+        count
+            Readings of each sensor, at poses spread evenly over those where it is free.
+        rng
+            Of the noise.
+        """
+        rows, fields = [], []
+        for sensor in sensors:
+            places = poses.R @ sensor.t_lidar_mag + poses.p
+            usable = np.flatnonzero(free(places))
+            row = usable[np.linspace(0, len(usable) - 1, count).round().astype(np.int64)]
+            b = np.einsum("nji,nj->ni", poses.R[row], field(places[row]))
+            rows.append(row)
+            fields.append(sensor.distortion.apply(b) + noise * rng.standard_normal(b.shape))
+        row = np.concatenate(rows)
+        readings = Readings(
+            tuple(each.sensor for each in sensors),
+            np.repeat(np.arange(len(sensors)), count),
+            poses.stamp_ns[row],
+            poses.R[row],
+            poses.p[row],
+            np.concatenate(fields),
+        )
+        return cls(readings, sensors, poses, np.zeros(len(sensors)))
+
+    def recording(self, source: SourceFile) -> Recording:
+        """Return the drive as it is recorded, each sensor on a topic and in a frame of its name."""
+        read = self.readings
+        series = tuple(
+            FieldSeries(name, f"/{name}", name, read.stamp_ns[own], read.field[own])
+            for index, name in enumerate(read.sensors)
+            for own in [read.rows_of(index)]
+        )
+        return Recording(self.trajectory, series, source)
+
     def truth(self) -> FloatArray:
         """Return t, C row by row, H and time offset of every sensor, shape (S, 16)."""
         return np.column_stack([np.stack([s.vector() for s in self.sensors]), self.offset])
-
-
-@dataclass(frozen=True)
-class Path:
-    """Poses of the lidar along a drive: rotations (N, 3, 3) and places (N, 3) in metres."""
-
-    R: FloatArray
-    p: FloatArray
-
-    def at(self, t_lidar: FloatArray) -> FloatArray:
-        """Return where a point of the lidar frame, shape (3,), comes along, shape (N, 3)."""
-        return np.asarray(self.R @ t_lidar + self.p)
 
 
 def survey(
@@ -98,7 +145,7 @@ def survey(
     points = np.concatenate(passes)
     points = points[hall.free(points, CLEARANCE_M)]
     field = hall.world.field(points) + noise * rng.standard_normal(points.shape)
-    return HallSurvey(points, field, heights, noise)
+    return HallSurvey(points, field)
 
 
 def calibration_drive(
@@ -116,23 +163,9 @@ def calibration_drive(
     outside of the area do not come about: each sensor has ``count`` others.
     """
     rng = np.random.default_rng([seed, 5])
-    path = _path(hall, rng, 8 * count)
-    mounted = _mounted(rng, span, sensors)
-    rows = [_rows(hall, path.at(s.t_lidar_mag), count) for s in mounted]
-    fields = [_measured(hall, path, s, r) for s, r in zip(mounted, rows, strict=True)]
-    field = np.concatenate(fields) + noise * rng.standard_normal((sensors * count, 3))
-    row = np.concatenate(rows)
-    readings = Readings(
-        tuple(s.sensor for s in mounted),
-        np.repeat(np.arange(sensors), count),
-        row * STEP_NS,
-        path.R[row],
-        path.p[row],
-        field,
-    )
-    stamps = STEP_NS * np.arange(len(path.p))
-    trajectory = Trajectory(stamps, path.R, path.p, "map", "lidar")
-    return CalibrationDrive(readings, mounted, trajectory, np.zeros(sensors))
+    poses, mounted = _path(hall, rng, 8 * count), _mounted(rng, span, sensors)
+    free = partial(hall.free, clearance=CLEARANCE_M)
+    return CalibrationDrive.along(poses, mounted, free, hall.world.field, noise, count, rng)
 
 
 def _pass(
@@ -151,7 +184,7 @@ def _pass(
     return np.column_stack([xy, height + hall.floor.height(xy)])
 
 
-def _path(hall: SteelHall, rng: np.random.Generator, count: int) -> Path:
+def _path(hall: SteelHall, rng: np.random.Generator, count: int) -> Trajectory:
     """Return a closed curve of a few loops over the floor, the vehicle heading along it."""
     order = np.arange(1, 7)
     s = 2 * np.pi * np.arange(count) / count
@@ -163,7 +196,7 @@ def _path(hall: SteelHall, rng: np.random.Generator, count: int) -> Path:
     return driven(hall, curve)
 
 
-def driven(hall: SteelHall, curve: FloatArray) -> Path:
+def driven(hall: SteelHall, curve: FloatArray) -> Trajectory:
     """Return poses along a curve, (N, 2), that bends around structures, heading along it."""
     curve = hall.pushed(curve, BODY_M)
     ahead = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
@@ -173,7 +206,8 @@ def driven(hall: SteelHall, curve: FloatArray) -> Path:
     pitch = -(cos * slope[:, 0] + sin * slope[:, 1])
     roll = -sin * slope[:, 0] + cos * slope[:, 1]
     R = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll])).as_matrix()
-    return Path(R, np.column_stack([curve, LIDAR_M + hall.floor.height(curve)]))
+    p = np.column_stack([curve, LIDAR_M + hall.floor.height(curve)])
+    return Trajectory(STEP_NS * np.arange(len(p)), R, p, "map", "lidar")
 
 
 def _mounted(
@@ -189,15 +223,3 @@ def _mounted(
         distortion = Distortion(C, rng.normal(0, 15, 3))
         sensors.append(KnownSensor(f"mag_{index:02d}", rng.uniform(low, high), distortion))
     return tuple(sensors)
-
-
-def _rows(hall: SteelHall, points: FloatArray, count: int) -> IntArray:
-    """Return the rows of a path, spread evenly over those where the sensor is free."""
-    free = np.flatnonzero(hall.free(points, CLEARANCE_M))
-    return free[np.linspace(0, len(free) - 1, count).round().astype(np.int64)]
-
-
-def _measured(hall: SteelHall, path: Path, sensor: KnownSensor, rows: IntArray) -> FloatArray:
-    """Return what a sensor reads without noise, shape (N, 3) in uT."""
-    B = hall.world.field(path.at(sensor.t_lidar_mag)[rows])
-    return sensor.distortion.apply(np.einsum("nji,nj->ni", path.R[rows], B))

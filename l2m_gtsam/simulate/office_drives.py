@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Trajectory
-from l2m_gtsam.simulate.hall_drives import CalibrationDrive
+from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Trajectory
+from l2m_gtsam.simulate.hall_drives import LIDAR_M, STEP_NS, CalibrationDrive
 from l2m_gtsam.simulate.office_corridor import (
     FREE_WIDTH,
     HALF_LENGTH,
@@ -12,8 +12,6 @@ from l2m_gtsam.simulate.office_corridor import (
 )
 
 LANES = 6  # of a survey at one height
-STEP_NS = 50_000_000
-LIDAR_M = 0.7  # height of the lidar over the floor
 REACH = np.array([HALF_LENGTH - 0.5, FREE_WIDTH - 0.3])  # of the lidar from the middle, metres
 ROCK = 0.02  # radians, standard deviation about x and y: the vehicle has springs
 MOUNTED = np.array([0.28, 0.28])  # of sensors from the lidar along x and y, metres
@@ -51,27 +49,13 @@ def office_drive(
     ``count`` readings, with a noise in uT, where it is away from the walls.
     """
     rng = np.random.default_rng([seed, 25])
-    R, p = poses_of(office, rng, 10 * count)
+    poses = poses_of(office, rng, 10 * count)
     known = tuple(mounted_sensor(rng, index, span) for index in range(sensors))
-    rows, fields = [], []
-    for sensor in known:
-        places = R @ sensor.t_lidar_mag + p
-        free = np.flatnonzero(office.free(places))
-        row = free[np.round(np.linspace(0, len(free) - 1, count)).astype(np.int64)]
-        b = np.einsum("nji,nj->ni", R[row], office.field(places[row]))
-        rows.append(row)
-        fields.append(sensor.distortion.apply(b) + noise * rng.standard_normal(b.shape))
-    row = np.concatenate(rows)
-    names, which = tuple(each.sensor for each in known), np.repeat(np.arange(sensors), count)
-    readings = Readings(names, which, row * STEP_NS, R[row], p[row], np.concatenate(fields))
-    trajectory = Trajectory(STEP_NS * np.arange(len(p)), R, p, "map", "lidar")
-    return CalibrationDrive(readings, known, trajectory, np.zeros(sensors))
+    return CalibrationDrive.along(poses, known, office.free, office.field, noise, count, rng)
 
 
-def poses_of(
-    office: OfficeCorridor, rng: np.random.Generator, count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return rotations (N, 3, 3) and places (N, 3) of the lidar along a closed path."""
+def poses_of(office: OfficeCorridor, rng: np.random.Generator, count: int) -> Trajectory:
+    """Return poses of the lidar along a closed path."""
     u = 2 * np.pi * np.arange(count) / count
     laps = int(rng.integers(2, 4))
     x = np.cos(laps * u + rng.uniform(-np.pi, np.pi)) + 0.25 * _swerves(rng, u, 5, 12)
@@ -86,7 +70,8 @@ def poses_of(
     rock = np.column_stack([_swerves(rng, u, 20, 40), _swerves(rng, u, 20, 40), np.zeros(count)])
     rock *= ROCK / np.maximum(rock.std(axis=0), 1e-12)
     R = R @ Rotation.from_rotvec(rock).as_matrix()
-    return R, np.column_stack([xy, LIDAR_M + office.height(xy)])
+    p = np.column_stack([xy, LIDAR_M + office.height(xy)])
+    return Trajectory(STEP_NS * np.arange(count), R, p, "map", "lidar")
 
 
 def _swerves(rng: np.random.Generator, u: FloatArray, low: int, high: int) -> FloatArray:

@@ -179,8 +179,14 @@ def simulate(options: ScenarioOptions, progress: Progress = silent) -> Scenario:
     place = _place(options, steel)
     suite, truth = mapping_suite(options.suite), random_array(options.array, array)
     eye = None if options.lidar is None else RayCaster(place.solids)
-    mapped = record(_mapper(options, place, suite, mapping), place.world, mapping, progress)
-    driven = record(_rover(options, place, truth, calibration), place.world, calibration, progress)
+    noise, day = options.noise, options.earth.date
+    motion = drive(options.mapping_drive, place.mapping_route, _stamp(day, MAPPING_TIME), mapping)
+    mapper = Vehicle("mapping", suite, motion, options.mapping_sampling, noise)
+    mapped = record(mapper, place.world, mapping, progress)
+    start_ns = _stamp(day, CALIBRATION_TIME)
+    motion = drive(options.calibration_drive, place.calibration_route, start_ns, calibration)
+    rover = Vehicle("calibration", truth, motion, options.calibration_sampling, noise)
+    driven = record(rover, place.world, calibration, progress)
     return Scenario(
         options=options,
         plan=place.plan,
@@ -200,30 +206,6 @@ def _place(options: ScenarioOptions, rng: np.random.Generator) -> SimulatedPlace
     if options.corridor is None:
         return hall(options.floor_plan, options.warehouse, routes, earth, rng)
     return corridor(options.corridor, options.warehouse, routes, earth, rng)
-
-
-def _mapper(
-    options: ScenarioOptions,
-    place: SimulatedPlace,
-    sensors: tuple[KnownSensor, ...],
-    rng: np.random.Generator,
-) -> Vehicle:
-    """Return the mapping vehicle on its drive over the whole floor."""
-    start_ns = _stamp(options.earth.date, MAPPING_TIME)
-    motion = drive(options.mapping_drive, place.mapping_route, start_ns, rng)
-    return Vehicle("mapping", sensors, motion, options.mapping_sampling, options.noise)
-
-
-def _rover(
-    options: ScenarioOptions,
-    place: SimulatedPlace,
-    sensors: tuple[KnownSensor, ...],
-    rng: np.random.Generator,
-) -> Vehicle:
-    """Return the vehicle with the array on its calibration drive."""
-    start_ns = _stamp(options.earth.date, CALIBRATION_TIME)
-    motion = drive(options.calibration_drive, place.calibration_route, start_ns, rng)
-    return Vehicle("calibration", sensors, motion, options.calibration_sampling, options.noise)
 
 
 def _slipped(

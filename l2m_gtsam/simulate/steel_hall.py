@@ -6,7 +6,6 @@ both, the field only the first. z = 0 is the floor, the area is centred on the o
 """
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,7 +20,6 @@ CELLS = (4, 3)  # one structure in each cell of 2 x 2 m
 INDUCED = 5.0  # polarisation along a part's length, relative to the Earth's field there
 CROSS = 0.25  # remanence across a part's length, relative to that along it
 TESLA_PER_MICROTESLA = 1e-6
-SHIFT_M = 0.03  # exactly, in a random horizontal direction
 HALF_AREA = np.array([4.0, 3.0])  # metres
 BEYOND = 1.0  # steel under the floor and over the ceiling lies this far beyond the area too
 SAMPLING_M, VOXEL_M = 0.04, 0.1
@@ -64,12 +62,10 @@ class SteelStructure:
     centre: FloatArray
     half: FloatArray
 
-    def cloud(self, shift: FloatArray) -> FloatArray:
-        """Return the voxels of its surface, moved by ``shift`` (3,) metres, shape (P, 3)."""
-        surfaces = [
-            _surface(dimensions) + centre + shift
-            for dimensions, centre in zip(self.boxes.dimensions, self.boxes.centres, strict=True)
-        ]
+    def cloud(self) -> FloatArray:
+        """Return the voxels of its surface, shape (P, 3)."""
+        pairs = zip(self.boxes.dimensions, self.boxes.centres, strict=True)
+        surfaces = [_surface(dimensions) + centre for dimensions, centre in pairs]
         return thinned_cloud(np.concatenate(surfaces), VOXEL_M)
 
 
@@ -155,16 +151,6 @@ def _surface(dimensions: FloatArray) -> FloatArray:
     return np.asarray(grid[np.any(np.abs(grid) > dimensions / 2 - 1e-9, axis=1)])
 
 
-class CloudVariant(StrEnum):
-    """What the LiDAR saw of the structures."""
-
-    NONE = "none"
-    ACCURATE = "accurate"
-    SHIFTED = "shifted 3 cm"
-    FALSE = "with false"
-    SHIFTED_FALSE = "shifted, with false"
-
-
 @dataclass(frozen=True)
 class Floor:
     """An uneven floor: a sum of waves.
@@ -212,6 +198,10 @@ class SteelHall:
     steel: tuple[SteelStructure, ...]
     timber: tuple[SteelStructure, ...]
     floor: Floor
+
+    def cloud(self) -> FloatArray:
+        """Return what a LiDAR saw of its structures, shape (P, 3) in metres."""
+        return np.concatenate([np.zeros((0, 3)), *(each.cloud() for each in self.steel)])
 
     def free(self, points: FloatArray, clearance: float) -> BoolArray:
         """Return which points, shape (N, 2 or 3), lie in the area and this far from structures."""
@@ -283,22 +273,6 @@ def steel_hall(seed: int, strength: float = MILD, posts: int = 4, racks: int = 1
     factor[len(floor.kinds) + len(ceiling.kinds) :] = strength
     world = _magnetised(rng, boxes, factor)
     return SteelHall(world, steel, timber, _uneven_floor(rng))
-
-
-def hall_cloud(hall: SteelHall, variant: CloudVariant, seed: int) -> FloatArray:
-    """Return what a LiDAR saw, shape (P, 3) in metres, empty for none."""
-    rng = np.random.default_rng([seed, 2])
-    angle = rng.uniform(-np.pi, np.pi, len(hall.steel))
-    unit = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
-    off = variant in (CloudVariant.SHIFTED, CloudVariant.SHIFTED_FALSE)
-    seen = () if variant is CloudVariant.NONE else hall.steel
-    clouds = [
-        structure.cloud(SHIFT_M * off * shift)
-        for structure, shift in zip(seen, unit[: len(seen)], strict=True)
-    ]
-    if variant in (CloudVariant.FALSE, CloudVariant.SHIFTED_FALSE):
-        clouds += [structure.cloud(np.zeros(3)) for structure in hall.timber]
-    return np.concatenate([np.zeros((0, 3)), *clouds])
 
 
 def _magnetised(rng: np.random.Generator, boxes: Boxes, factor: FloatArray) -> SteelWorld:

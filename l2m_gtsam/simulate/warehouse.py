@@ -1,13 +1,13 @@
 """The steel of a warehouse: places and magnetisation of its parts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, joined_rows
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.floor_plan import FloorPlan
 from l2m_gtsam.simulate.world import SteelWorld
@@ -34,7 +34,7 @@ class Parts:
     Attributes
     ----------
     fill
-        Share of their outer section that is steel.
+        Shares of their outer sections that are steel, shape (N,).
     dimensions, centres
         In metres, shape (N, 3).
     yaw
@@ -42,7 +42,7 @@ class Parts:
     """
 
     kind: str
-    fill: float
+    fill: FloatArray
     dimensions: FloatArray
     centres: FloatArray
     yaw: FloatArray
@@ -53,7 +53,8 @@ def alike(
 ) -> Parts:
     """Return parts of one size along the hall's axes."""
     count = len(centres)
-    return Parts(kind, section.fill, np.tile(size, (count, 1)), centres, np.zeros(count))
+    sizes = np.tile(size, (count, 1))
+    return Parts(kind, np.full(count, section.fill), sizes, centres, np.zeros(count))
 
 
 def spread(low: float, high: float, pitch: float) -> FloatArray:
@@ -137,17 +138,16 @@ def build_warehouse(
         _hall_beams(options, plan),
         _rebar(options, plan, rng),
     )
-    dimensions = np.concatenate([parts.dimensions for parts in families])
-    yaw = np.concatenate([parts.yaw for parts in families])
-    fill = np.concatenate([np.full(len(parts.yaw), parts.fill) for parts in families])
-    R_map_body = Rotation.from_rotvec(np.outer(yaw, [0.0, 0.0, 1.0])).as_matrix()
-    induced = _induced(options, dimensions, fill, np.einsum("nij,i->nj", R_map_body, earth))
+    steel = joined_rows(families)
+    R_map_body = Rotation.from_rotvec(np.outer(steel.yaw, [0.0, 0.0, 1.0])).as_matrix()
+    there = np.einsum("nij,i->nj", R_map_body, earth)
+    induced = _induced(options, steel.dimensions, steel.fill, there)
     return SteelWorld(
         kinds=tuple(parts.kind for parts in families for _ in parts.yaw),
-        dimensions=dimensions,
-        centres=np.concatenate([parts.centres for parts in families]),
+        dimensions=steel.dimensions,
+        centres=steel.centres,
         R_map_body=R_map_body,
-        polarisations=induced + _remanent(options, dimensions, fill, rng),
+        polarisations=induced + _remanent(options, steel.dimensions, steel.fill, rng),
         earth=earth,
     )
 
@@ -238,4 +238,4 @@ def _rebar(options: WarehouseOptions, plan: FloorPlan, rng: np.random.Generator)
     # Bars are laid along or across the hall, a few degrees askew.
     quarter_turns = rng.integers(0, 2, len(places)) * np.pi / 2
     yaw = quarter_turns + rng.normal(0.0, np.deg2rad(3.0), len(places))
-    return Parts("rebar", section.fill, np.tile(size, (len(places), 1)), centres, yaw)
+    return replace(alike("rebar", section, size, centres), yaw=yaw)

@@ -1,9 +1,9 @@
 """The calibrator from the package index: `magyc`, which wants a gyroscope and a uniform field.
 
-It uses no map. From readings and turn rates it estimates H and the soft iron: where the field is
-the same everywhere it changes, seen from the sensor, only as the sensor turns, dB/dt = -w x B.
-Position, rotation and scale remain open. What it needs contradicts what we need (numpy below
-2), so that it has an environment of its own, made by ``make magyc``.
+It uses no map. From readings and turn rates it estimates H and the soft iron, which is not used
+here: where the field is the same everywhere it changes, seen from the sensor, only as the sensor
+turns, dB/dt = -w x B. Position, rotation and scale remain open. What it needs contradicts what we
+need (numpy below 2), so that it has an environment of its own, made by ``make magyc``.
 
 It is made for chips that hold both a magnetometer and a gyroscope, along the same axes, and wants
 them so: six degrees between the two cost it 1.5 uT. A study that knows the truth gives it the rates
@@ -21,7 +21,6 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.errors import PeerError
-from l2m_gtsam.studies.methods import PeerEstimate, soft_iron
 
 PYTHON_VARIABLE = "L2M_MAGYC_PYTHON"
 PYTHON = Path(".venv-magyc/bin/python")
@@ -45,6 +44,14 @@ class ChipDrive:
     R_mag_lidar: FloatArray
 
 
+@dataclass(frozen=True)
+class FoundOffset:
+    """What magyc makes of a drive: H in uT, shape (3,), NaN without a result, and its seconds."""
+
+    H: FloatArray
+    seconds: float
+
+
 def magyc_python() -> Path:
     """Return the Python of the environment of magyc.
 
@@ -55,17 +62,16 @@ def magyc_python() -> Path:
     """
     python = Path(os.environ.get(PYTHON_VARIABLE, PYTHON))
     if not python.is_file():
-        msg = (
+        raise PeerError(
             f"magyc has no environment at {python}: run `make magyc`, or name its Python in "
             f"{PYTHON_VARIABLE}"
         )
-        raise PeerError(msg)
     # The link in bin/ is what makes it that environment: never resolved.
     return python.absolute()
 
 
-def magyc_peer(drives: Sequence[ChipDrive], python: Path) -> tuple[PeerEstimate, ...]:
-    """Return what magyc finds on each of some drives: H and the soft iron.
+def magyc_peer(drives: Sequence[ChipDrive], python: Path) -> tuple[FoundOffset, ...]:
+    """Return what magyc finds on each of some drives.
 
     Loading it takes longer than a calibration, so that all drives go into one process. All
     readings enter, for it differences them.
@@ -97,8 +103,7 @@ def _arrays(drives: Sequence[ChipDrive]) -> dict[str, FloatArray]:
     for index, each in enumerate(drives):
         readings, motion = each.readings, each.readings.motion
         if motion is None:
-            msg = f"magyc needs turn rates: the readings of drive {index} have no motion"
-            raise PeerError(msg)
+            raise PeerError(f"magyc needs turn rates: the readings of drive {index} have no motion")
         arrays[f"field_{index}"] = readings.field / GAUSS
         arrays[f"rate_{index}"] = motion.twist_lidar[:, :3] @ each.R_mag_lidar.T
         arrays[f"time_{index}"] = (readings.stamp_ns - readings.stamp_ns[:1]) * 1e-9
@@ -114,9 +119,7 @@ def _run(python: Path, source: Path, target: Path) -> None:
         raise PeerError(f"magyc does not run in {python}: {last}; make its environment anew")
 
 
-def _estimate(hard_iron: FloatArray, matrix: FloatArray, seconds: float) -> PeerEstimate:
+def _estimate(hard_iron: FloatArray, soft_iron: FloatArray, seconds: float) -> FoundOffset:
     """Return a result in microtesla."""
-    nothing = PeerEstimate.nothing(float(seconds))
-    if not np.isfinite([*hard_iron, *matrix.ravel()]).all():
-        return nothing
-    return PeerEstimate(nothing.t, nothing.C, hard_iron * GAUSS, soft_iron(matrix), nothing.seconds)
+    found = np.isfinite([*hard_iron, *soft_iron.ravel()]).all()
+    return FoundOffset(hard_iron * GAUSS if found else np.full(3, np.nan), float(seconds))

@@ -6,7 +6,6 @@ readings. Thinning keeps it affordable: every query of the map costs the number 
 times the number of survey readings.
 """
 
-import time
 import warnings
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +19,6 @@ from l2m_gtsam.data import Distortion, FloatArray, IntArray, Readings
 from l2m_gtsam.errors import MapError, PeerError
 from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.options import Options
-from l2m_gtsam.studies.methods import PeerEstimate, soft_iron
 
 FEWEST = 20
 
@@ -96,9 +94,9 @@ def naive_map(
 
 
 def naive_peer(
-    readings: Readings, field_map: NaiveMap, t_start: FloatArray, options: NaiveOptions
-) -> PeerEstimate:
-    """Return where the least squares end from a start, with C = I and H = 0.
+    readings: Readings, field_map: NaiveMap, options: NaiveOptions, t_start: FloatArray
+) -> FloatArray:
+    """Return t, C row by row and H where the least squares end from C = I and H = 0, shape (15,).
 
     Parameters
     ----------
@@ -106,10 +104,10 @@ def naive_peer(
         Of one sensor.
     field_map
         Of the site.
-    t_start
-        The guess in the lidar frame in metres, shape (3,).
     options
         How many readings enter, and how many steps are made.
+    t_start
+        The guess in the lidar frame in metres, shape (3,).
     """
     count = min(len(readings), options.readings)
     part = readings[np.linspace(0, len(readings) - 1, count).round().astype(np.int64)]
@@ -119,12 +117,9 @@ def naive_peer(
         b_lidar = np.einsum("nji,nj->ni", part.R_map_lidar, field)
         return (Distortion.from_vector(x[3:]).apply(b_lidar) - part.field).ravel()
 
-    begin = time.perf_counter()
     start = np.concatenate([t_start, Distortion.identity().vector()])
-    end = least_squares(residuals, start, x_scale="jac", max_nfev=options.iterations).x
-    seconds = time.perf_counter() - begin
-    found = Distortion.from_vector(end[3:])
-    return PeerEstimate(end[:3], found.C, found.H, soft_iron(found.C), seconds)
+    end = least_squares(residuals, start, x_scale="jac", max_nfev=options.iterations)
+    return np.asarray(end.x)
 
 
 def _near(survey: TrainingSet, path: FloatArray, options: NaiveOptions) -> IntArray:
@@ -132,12 +127,11 @@ def _near(survey: TrainingSet, path: FloatArray, options: NaiveOptions) -> IntAr
     distance, _ = cKDTree(path).query(survey.points)
     rows = np.flatnonzero(distance <= options.reach)
     if len(rows) < FEWEST:
-        msg = (
+        raise MapError(
             f"naive peer: {len(rows)} of {len(survey)} survey readings lie within "
             f"{options.reach:g} m of the drive, {FEWEST} are needed: survey where it drives, or "
             "set a wider reach"
         )
-        raise MapError(msg)
     rows = np.random.default_rng(options.seed).permutation(rows)
     cubes = np.floor(survey.points[rows] / options.spacing).astype(np.int64)
     _, first = np.unique(cubes, axis=0, return_index=True)

@@ -112,16 +112,25 @@ def random_drive(
     site: Site | SurveyedSite, options: SiteOptions, rng: np.random.Generator
 ) -> SiteDrive:
     """Return a drive through the site with a sensor of random place and distortion."""
-    scenario = options.scenario
     place = random_place(options, rng)
-    sensor = KnownSensor("mag", place, random_distortion(scenario.array, rng))
+    sensor = KnownSensor("mag", place, random_distortion(options.scenario.array, rng))
+    return SiteDrive(sensor, readings_of(site, options, (sensor,), rng))
+
+
+def readings_of(
+    site: Site | SurveyedSite,
+    options: SiteOptions,
+    sensors: tuple[KnownSensor, ...],
+    rng: np.random.Generator,
+) -> Readings:
+    """Return what sensors read on a drive through the site."""
+    scenario = options.scenario
     route = calibration_route(scenario.calibration_route, site.plan)
     motion = drive(scenario.calibration_drive, route, 0, rng)
-    vehicle = Vehicle(
-        "calibration", (sensor,), motion, scenario.calibration_sampling, scenario.noise
-    )
+    sampling = scenario.calibration_sampling
+    vehicle = Vehicle("calibration", sensors, motion, sampling, scenario.noise)
     simulated = record(vehicle, site.world, rng, silent)
-    return SiteDrive(sensor, synchronise(simulated.recording, options.sync).readings)
+    return synchronise(simulated.recording, options.sync).readings
 
 
 def random_place(options: SiteOptions, rng: np.random.Generator) -> FloatArray:

@@ -1,6 +1,7 @@
 """What happened to the steel that a drive shows beside a map: came, went or moved, and when."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -117,9 +118,7 @@ def with_moves(changes: list[DatedChange], first: int) -> list[DatedChange]:
         alike = [k for k in went if same_size(change.source, changes[k].source)]
         if not change.went and alike:
             went.remove(alike[0])
-            change = DatedChange(
-                change.what, change.source, change.drive, change.before, first + alike[0]
-            )
+            change = replace(change, other=first + alike[0])
         moved.append(change)
     return moved
 

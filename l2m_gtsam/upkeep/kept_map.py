@@ -169,73 +169,78 @@ def kept_up(
         )
     for each in recordings:
         check_frame(field_map, each)
+    vehicle = MappingVehicle(suite, options, changes)
     drives = [(date_of(each), each) for each in recordings]
     for drive, recording in sorted(drives, key=lambda each: str(each[0].begun)):
-        field_map = after_drive(field_map, recording, drive, suite, options, changes, survey)
+        field_map = after_drive(field_map, vehicle, recording, drive, survey)
     return field_map
+
+
+@dataclass(frozen=True)
+class MappingVehicle:
+    """A vehicle by whose drives a map is kept up.
+
+    Attributes
+    ----------
+    suite
+        Its calibrated sensors by name.
+    options
+        Which of their readings enter.
+    changes
+        How sources are looked for.
+    """
+
+    suite: Mapping[str, KnownSensor]
+    options: MappingOptions
+    changes: ChangesOptions
+
+    def shows(self, recording: Recording, field_map: HarmonicMap) -> SeenSources:
+        """Return what a drive shows beside a map."""
+        known = [listed_sensor(each.sensor, self.suite, recording) for each in recording.series]
+        offset = np.array([each.time_offset for each in known])
+        latest = float(np.abs(offset).max())
+        readings = synchronise(recording, self.options.sync, latest).readings
+        readings = with_offsets(readings, recording.trajectory, offset)
+        return seen_sources(readings, known, field_map.compile(), self.changes)
+
+    def kept(
+        self,
+        field_map: HarmonicMap,
+        recording: Recording,
+        drive: MapDrive,
+        seen: SeenSources,
+        survey: MapDrive,
+    ) -> HarmonicMap:
+        """Return a map after a drive that shows some sources; otherwise as ``after_drive``."""
+        read = suite_readings([recording], self.suite, self.options.sync)
+        found = dated_changes(field_map, seen.sources, diary_of(field_map, survey))
+        return renewed(field_map, drive_readings(read, drive), found, survey).doubted(read.doubts)
 
 
 def after_drive(
     field_map: HarmonicMap,
+    vehicle: MappingVehicle,
     recording: Recording,
     drive: MapDrive,
-    suite: Mapping[str, KnownSensor],
-    options: MappingOptions,
-    changes: ChangesOptions,
     survey: MapDrive,
 ) -> HarmonicMap:
     """Return a map after one drive; see ``kept_up``."""
-    history = field_map.learnt.history
-    check_order(recording, drive, MapDiary((survey,)) if history is None else history.diary)
-    steady = steady_survey([recording], suite, options.suite)
+    check_order(recording, drive, diary_of(field_map, survey))
+    steady = steady_survey([recording], vehicle.suite, vehicle.options.suite)
     (recording,) = steady.recordings
-    seen = shown_by(recording, field_map, suite, options, changes)
+    seen = vehicle.shows(recording, field_map)
     if seen.of_vehicle:
         raise MapError(
             f"{recording.source.path}: its sensors do not read as they are calibrated, wherever "
             "they are; see `l2m validate`, and calibrate them anew"
         )
-    given = drive, suite, options, seen, survey
-    return with_drive(field_map, recording, *given).doubted(steady.doubts)
+    return vehicle.kept(field_map, recording, drive, seen, survey).doubted(steady.doubts)
 
 
-def shown_by(
-    recording: Recording,
-    field_map: HarmonicMap,
-    suite: Mapping[str, KnownSensor],
-    options: MappingOptions,
-    changes: ChangesOptions,
-) -> SeenSources:
-    """Return what a drive shows beside a map."""
-    readings, known = read_by(recording, suite, options)
-    return seen_sources(readings, known, field_map.compile(), changes)
-
-
-def with_drive(
-    field_map: HarmonicMap,
-    recording: Recording,
-    drive: MapDrive,
-    suite: Mapping[str, KnownSensor],
-    options: MappingOptions,
-    seen: SeenSources,
-    survey: MapDrive,
-) -> HarmonicMap:
-    """Return a map after a drive that shows some sources; otherwise as ``after_drive``."""
+def diary_of(field_map: HarmonicMap, survey: MapDrive) -> MapDiary:
+    """Return what a map was given so far; of one that does not know, its survey alone."""
     history = field_map.learnt.history
-    diary = MapDiary((survey,)) if history is None else history.diary
-    read = suite_readings([recording], suite, options.sync)
-    found = dated_changes(field_map, seen.sources, diary)
-    return renewed(field_map, drive_readings(read, drive), found, survey).doubted(read.doubts)
-
-
-def read_by(
-    recording: Recording, suite: Mapping[str, KnownSensor], options: MappingOptions
-) -> tuple[Readings, list[KnownSensor]]:
-    """Return the readings of a drive at the clocks of its sensors, and these."""
-    known = [listed_sensor(series.sensor, suite, recording) for series in recording.series]
-    offset = np.array([each.time_offset for each in known])
-    readings = synchronise(recording, options.sync, float(np.abs(offset).max())).readings
-    return with_offsets(readings, recording.trajectory, offset), known
+    return MapDiary((survey,)) if history is None else history.diary
 
 
 def drive_readings(read: SurveyReadings, drive: MapDrive) -> DriveReadings:

@@ -64,7 +64,7 @@ def mapped_half(
         field_map = drives.instead((half,)).mapped(1, cloud)
         if not isinstance(field_map, HarmonicMap):
             return None
-        seen = drives.shown(other, field_map)
+        seen = drives.vehicle.shows(other, field_map)
     except L2MError:  # too little by itself to tell
         return None
     return None if seen.of_vehicle or not seen.sources else MappedHalf(field_map, other, seen)
@@ -72,7 +72,8 @@ def mapped_half(
 
 def moment_of(drives: SurveyDrives, found: MappedHalf, *, before: bool) -> int:
     """Return the stamp from which on the place is another, in nanoseconds."""
-    read = survey_readings(found.other, drives.suite, drives.options.sync)
+    vehicle = drives.vehicle
+    read = survey_readings(found.other, vehicle.suite, vehicle.options.sync)
     known = found.field_map.query(read.points)
     lacking = read.field - known.field
     shapes = [shape_of(each) for each in found.seen.sources]

@@ -22,7 +22,7 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.upkeep.agreement import disagreement
-from l2m_gtsam.upkeep.kept_map import SeenSources, drive_dates, shown_by, with_drive
+from l2m_gtsam.upkeep.kept_map import MappingVehicle, SeenSources, drive_dates
 
 # Twice a logarithm of likelihood. At its edges a map of coarse waves misses 0.2 A m^2 of steel that
 # is not there, by 50 of it; a fork lift beside the path has 10^5.
@@ -31,12 +31,10 @@ LEAST_GAIN = 100.0
 
 @dataclass(frozen=True)
 class SurveyDrives:
-    """Drives of a survey in the order of their time, and the sensors that are assumed."""
+    """Drives of a survey in the order of their time, and the vehicle that is assumed."""
 
     steady: SteadySurvey
-    suite: Mapping[str, KnownSensor]
-    options: MappingOptions
-    changes: ChangesOptions
+    vehicle: MappingVehicle
 
     @classmethod
     def of(
@@ -50,12 +48,13 @@ class SurveyDrives:
         recordings = sorted(steady.recordings, key=lambda each: int(each.trajectory.stamp_ns[0]))
         names = {series.sensor for each in recordings for series in each.series}
         known = {name: KnownSensor.ideal(name) for name in names} if suite is None else suite
-        return cls(replace(steady, recordings=recordings), known, options, changes)
+        vehicle = MappingVehicle(known, options, changes)
+        return cls(replace(steady, recordings=recordings), vehicle)
 
     @property
     def stated(self) -> bool:
         """Whether it is stated how well any sensor is known."""
-        return any(each.covariance is not None for each in self.suite.values())
+        return any(each.covariance is not None for each in self.vehicle.suite.values())
 
     def instead(self, recordings: Sequence[Recording]) -> "SurveyDrives":
         """Return the same with other drives, in order of time."""
@@ -67,13 +66,13 @@ class SurveyDrives:
 
     def mapped(self, count: int, cloud: FloatArray | None) -> FieldMap:
         """Return a map of so many drives."""
-        return map_of(self.first(count), self.suite, self.options, cloud)
+        return map_of(self.first(count), self.vehicle.suite, self.vehicle.options, cloud)
 
     def disagreement(self, field_map: HarmonicMap) -> float:
         """Return by how much the drives differ, or both halves of one; 1 is beyond chance."""
         recordings, parts, number = self.steady.recordings, [], []
         for k, each in enumerate(recordings):
-            read = survey_readings(each, self.suite, self.options.sync)
+            read = survey_readings(each, self.vehicle.suite, self.vehicle.options.sync)
             late = (read.stamp_ns >= middle(each)).astype(np.int64)
             number.append(np.full_like(late, k) if len(recordings) > 1 else late)
             known = read.suite.as_found_by(field_map.learnt.suite)
@@ -91,17 +90,14 @@ class SurveyDrives:
         for number, recording in enumerate(recordings[1:], start=1):
             if not isinstance(field_map, HarmonicMap):
                 break
-            seen = self.shown(recording, field_map)
+            seen = self.vehicle.shows(recording, field_map)
             if max(seen.gain, seen.vehicle) > LEAST_GAIN and (seen.sources or seen.of_vehicle):
                 return Unlike(number, seen, field_map)
-            given = recording, self.suite, self.options.sync, self.options.pose_noise
+            options = self.vehicle.options
+            given = recording, self.vehicle.suite, options.sync, options.pose_noise
             read = survey_readings(*given)
             field_map = field_map.updated(read.points, read.field, read.suite, read.poses)
         return None
-
-    def shown(self, recording: Recording, field_map: HarmonicMap) -> SeenSources:
-        """Return what a drive shows beside a map of others."""
-        return shown_by(recording, field_map, self.suite, self.options, self.changes)
 
     def kept_up(self, first: "Unlike", cloud: FloatArray | None) -> FieldMap:
         """Return a map of the drives before one that differs, after that one and all later."""
@@ -113,11 +109,11 @@ class SurveyDrives:
         for each in recordings[number:]:
             if not isinstance(field_map, HarmonicMap):
                 break
-            seen = seen or self.shown(each, field_map)
+            seen = seen or self.vehicle.shows(each, field_map)
             if seen.of_vehicle:
                 return self.doubted(each, cloud)
-            given = drive_dates(each), self.suite, self.options, seen, survey
-            field_map, seen = with_drive(field_map, each, *given), None
+            given = each, drive_dates(each), seen, survey
+            field_map, seen = self.vehicle.kept(field_map, *given), None
         return field_map
 
     def doubted(self, recording: Recording, cloud: FloatArray | None) -> FieldMap:

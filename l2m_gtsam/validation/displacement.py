@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import skew
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.coverage import errors_over_stated
-from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.qa.metrics.changes import MISSED
 from l2m_gtsam.qa.metrics.coordinates import PARAMETERS, width
@@ -48,7 +47,6 @@ from l2m_gtsam.validation.recheck import (
     SensorDrive,
     left_by,
     recheck,
-    usable,
 )
 
 FREEDOMS = 6
@@ -108,23 +106,26 @@ class SensorsOnDrive:
 
     Attributes
     ----------
-    drives, known, spreads
-        Readings, calibrations and covariances, (16, 16) and finite, of S sensors.
+    drives, spreads
+        S sensors in one map, and covariances of their calibrations, (16, 16) and finite.
     alike
         Share of each covariance that errors have which the calibrations of several sensors may
         have in common, as those of map and poses.
-    field_map
-        The map.
-    options
-        Of the solve.
     """
 
     drives: tuple[SensorDrive, ...]
-    known: tuple[KnownCalibration, ...]
     spreads: tuple[FloatArray, ...]
     alike: tuple[float, ...]
-    field_map: QueryableMap
-    options: OneKeyOptions
+
+    @property
+    def known(self) -> list[KnownCalibration]:
+        """Their calibrations."""
+        return [drive.known for drive in self.drives]
+
+    @property
+    def options(self) -> OneKeyOptions:
+        """Of the solve."""
+        return self.drives[0].options
 
     def displaced(self, by: PoseDisplacement) -> "SensorsOnDrive":
         """Return them with poses that are displaced."""
@@ -133,8 +134,7 @@ class SensorsOnDrive:
 
     def usable(self) -> list[BoolArray]:
         """Return which readings of each sensor count."""
-        pairs = zip(self.drives, self.known, strict=True)
-        return [usable(drive, self.field_map, known, self.options) for drive, known in pairs]
+        return [drive.usable() for drive in self.drives]
 
     def likelihood(
         self, counting: Sequence[BoolArray], *here: PoseDisplacement
@@ -143,16 +143,17 @@ class SensorsOnDrive:
 
         Of each sensor the readings that are ``counting``, as of ``usable``, are taken.
         """
-        each = zip(self.drives, self.known, counting, strict=True)
-        parts = [drive.at(float(known.vector[15])).select(used) for drive, known, used in each]
+        each = zip(self.drives, counting, strict=True)
+        parts = [drive.timed.select(used) for drive, used in each]
+        field_map = self.drives[0].field_map
         whole = change_likelihood(
             parts,
-            self.field_map,
+            field_map,
             self.known,
             self.options.pose_noise.lasting_s,
             lambda readings: np.concatenate([by.features(readings) for by in here], axis=2),
             # What a map is wrong by beyond what it states is alike for all sensors.
-            errors_over_stated(self.field_map),
+            errors_over_stated(field_map),
         )
         # Displacements are the last coordinates, behind those of the calibrations.
         free = FREEDOMS * len(here)
@@ -171,8 +172,8 @@ class SensorsOnDrive:
 
     def rechecked(self, chance: float) -> list[Recheck]:
         """Return a test of each sensor."""
-        each = zip(self.drives, self.known, self.spreads, strict=True)
-        return [recheck(d, self.field_map, k, P, self.options, chance) for d, k, P in each]
+        each = zip(self.drives, self.spreads, strict=True)
+        return [recheck(drive, P, chance) for drive, P in each]
 
     def left(self, tests: Sequence[Recheck]) -> float:
         """Return the squared innovation that tests' changes do not explain.
@@ -180,10 +181,9 @@ class SensorsOnDrive:
         A reading that does not count leaves as much as the largest one that does: else what
         rejects most would explain best.
         """
-        each = zip(tests, self.drives, self.known, strict=True)
         rejected = sum(np.sum(~test.used) for test in tests)
         return float(rejected) * self.options.robust.largest + sum(
-            left_by(test, drive, self.field_map, known, self.options) for test, drive, known in each
+            left_by(*each) for each in zip(tests, self.drives, strict=True)
         )
 
 

@@ -68,18 +68,20 @@ class DriveTest:
     reads_as: Mapping[str, str] = field(default_factory=dict)
 
     def drive_of(self, sensor: SensorCalibration) -> SensorDrive:
-        """Return what a sensor read, without what follows recorded numbers and courses of H."""
-        found = drive_of(self.readings, self.recording, sensor)
-        own = found.readings
+        """Return a sensor, without what follows recorded numbers and courses of H."""
+        own = without_numbers(self.readings, self.recording, sensor)
         for course in self.courses_of(sensor):
             own = without_course(own, course)
-        return replace(found, readings=own)
+        known, poses = self.known(sensor), self.recording.trajectory
+        return SensorDrive(own, poses, known, self.field_map, self.options.solve)
 
     def known(self, sensor: SensorCalibration) -> KnownCalibration:
         """Return its calibration; a course of H is a number whose field may be anything."""
-        found, courses = _known(self.recording, sensor), len(self.courses_of(sensor))
-        anything = np.full((courses, 3), ANYTHING_UT)
-        return replace(found, number_sigma=np.concatenate([found.number_sigma, anything]))
+        vector = np.append(sensor.vector(), offset_s(sensor))
+        names = [each.name for each in self.recording.scalars]
+        sigma = _of_numbers(names, {each.name: each.sigma for each in sensor.moving})
+        anything = np.full((len(self.courses_of(sensor)), 3), ANYTHING_UT)
+        return KnownCalibration(vector, sensor.noise, np.concatenate([sigma, anything]))
 
     def courses_of(self, sensor: SensorCalibration) -> tuple[Course, ...]:
         """Return the jumps and drifts of a sensor."""
@@ -89,11 +91,8 @@ class DriveTest:
         """Return sensors with their calibrations."""
         return SensorsOnDrive(
             tuple(map(self.drive_of, known)),
-            tuple(map(self.known, known)),
             tuple(finite(joint_covariance(each), self.options.solve) for each in known),
             tuple(map(alike_share, known)),
-            self.field_map,
-            self.options.solve,
         )
 
 
@@ -132,49 +131,35 @@ def drive_test(
 
 def tested(test: DriveTest, sensor: SensorCalibration) -> ValidatedSensor | NotValidated:
     """Return one sensor tested on the drive, or why it cannot be."""
-    drive, options = test.drive_of(sensor), test.options
-    limits = test.limits[sensor.sensor]
-    if reason := _why_untested(drive, test.field_map, sensor, options, sensor.sensor in test.stuck):
+    drive, limits = test.drive_of(sensor), test.limits[sensor.sensor]
+    if reason := _why_untested(drive, sensor.sensor in test.stuck):
         beyond = f"{saturation_sentence(limits)}. " if limits else ""
         return NotValidated(sensor.sensor, f"{beyond}{reason}", faulty=True)
-    known, covariance = test.known(sensor), joint_covariance(sensor)
-    found = recheck(drive, test.field_map, known, covariance, options.solve, test.chance)
-    figures = sensor_figures(drive, test.field_map, sensor, found, test.thinning, test.chance)
+    found = recheck(drive, joint_covariance(sensor), test.chance)
+    figures = sensor_figures(drive, sensor, found, test.thinning, test.chance)
     return replace(figures, limits=limits, reads_as=test.reads_as.get(sensor.sensor, ""))
 
 
-def _why_untested(
-    drive: SensorDrive,
-    field_map: QueryableMap,
-    sensor: SensorCalibration,
-    options: CalibrationOptions,
-    stuck: bool,
-) -> str:
+def _why_untested(drive: SensorDrive, stuck: bool) -> str:
     """Return why a sensor cannot be tested; empty if it can."""
-    readings, needed = drive.at(offset_s(sensor)), options.solve.min_readings
+    count, needed = len(drive.timed), drive.options.min_readings
     if stuck:
         return "It reports one constant value: it is stuck."
-    if len(readings) < needed:
-        return f"Only {len(readings)} of its readings have a pose; at least {needed} are needed."
-    place = readings.R_map_lidar @ sensor.t_lidar_mag + readings.p_map_lidar
-    within = int(field_map.query(place).inside.sum())
+    if count < needed:
+        return f"Only {count} of its readings have a pose; at least {needed} are needed."
+    within = int(drive.inside().sum())
     if within < needed:
         return (
-            f"{len(place) - within} of its {len(place)} readings lie outside the map; at least "
+            f"{count - within} of its {count} readings lie outside the map; at least "
             f"{needed} must lie inside. Is it the map of this place, and are the poses in its "
             "frame?"
         )
     return ""
 
 
-def _known(recording: Recording, sensor: SensorCalibration) -> KnownCalibration:
-    vector = np.append(sensor.vector(), offset_s(sensor))
-    names = [each.name for each in recording.scalars]
-    sigma = _of_numbers(names, {each.name: each.sigma for each in sensor.moving})
-    return KnownCalibration(vector, sensor.noise, sigma)
-
-
-def drive_of(readings: Readings, recording: Recording, sensor: SensorCalibration) -> SensorDrive:
+def without_numbers(
+    readings: Readings, recording: Recording, sensor: SensorCalibration
+) -> Readings:
     """Return what one sensor read, without what follows recorded numbers.
 
     Raises
@@ -189,10 +174,10 @@ def drive_of(readings: Readings, recording: Recording, sensor: SensorCalibration
             f"a part of the readings of {sensor.sensor} follows {unknown[0]!r}, which "
             "`bag.regressors` does not name; say in --config where it is recorded"
         )
-    if own.regressors is not None and sensor.moving:
-        h = _of_numbers(names, {each.name: each.h for each in sensor.moving})
-        own = replace(own, field=without_moving(own.field, own.regressors, h))
-    return SensorDrive(own, recording.trajectory)
+    if own.regressors is None or not sensor.moving:
+        return own
+    h = _of_numbers(names, {each.name: each.h for each in sensor.moving})
+    return replace(own, field=without_moving(own.field, own.regressors, h))
 
 
 def _of_numbers(names: Sequence[str], values: dict[str, FloatArray]) -> FloatArray:

@@ -47,7 +47,6 @@ def offset_s(sensor: SensorCalibration) -> float:
 
 def sensor_figures(
     drive: SensorDrive,
-    field_map: QueryableMap,
     sensor: SensorCalibration,
     found: Recheck,
     thinning: Thinning,
@@ -68,12 +67,9 @@ def sensor_figures(
     chance
         Of the test.
     """
-    readings = drive.at(offset_s(sensor))
-    place = readings.R_map_lidar @ sensor.t_lidar_mag + readings.p_map_lidar
-    within = field_map.query(place).inside
-    evidence = sensor_evidence(
-        DriveEvidence(readings, within, within & ~found.used), sensor, field_map
-    )
+    within = drive.inside()
+    seen = DriveEvidence(drive.timed, within, within & ~found.used)
+    evidence = sensor_evidence(seen, sensor, drive.field_map)
     used, fields = evidence.used, curves(evidence, sensor)
     fit = fit_figures(evidence, sensor.noise)
     likelihood, freedom = found.likelihood, found.freedom

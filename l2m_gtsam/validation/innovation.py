@@ -114,22 +114,20 @@ class KnownCalibration:
     noise: float
     number_sigma: FloatArray
 
+    @property
+    def C(self) -> FloatArray:
+        """Distortion matrix, shape (3, 3)."""
+        return self.vector[3:12].reshape(3, 3)
+
     def estimate(self) -> Estimate:
         """Return it as an estimate of a single sensor."""
-        return estimate_of(self.vector[None], np.array([self.noise]))
+        return estimate_of([self])
 
 
-def estimate_of(vectors: FloatArray, noise: FloatArray) -> Estimate:
-    """Return S sensors as a solve has them.
-
-    Parameters
-    ----------
-    vectors
-        t, C row by row, H and time offset of each, shape (S, 16).
-    noise
-        Standard deviation of each one's noise in uT, shape (S,).
-    """
-    ridge = np.zeros(len(vectors))
+def estimate_of(known: Sequence[KnownCalibration]) -> Estimate:
+    """Return sensors as a solve has them."""
+    vectors = np.array([each.vector for each in known])
+    noise, ridge = np.array([each.noise for each in known]), np.zeros(len(known))
     return Estimate(vectors[:, :3], vectors[:, 3:15], noise, ridge, vectors[:, 15])
 
 
@@ -177,9 +175,7 @@ def change_likelihood(
         displacements.
     """
     readings = together(parts)
-    estimate = estimate_of(
-        np.array([each.vector for each in known]), np.array([each.noise for each in known])
-    )
+    estimate = estimate_of(known)
     view = observe(readings, field_map, estimate, 1)
     errors = field_map if isinstance(field_map, UncertainMap) else NothingShared()
     coverage = cover(view, errors, estimate, correlation_s).with_larger_errors(map_errors)

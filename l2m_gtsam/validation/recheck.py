@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -36,7 +37,7 @@ FURTHEST_M, LONGEST_S = 1.0, 0.25  # that a change is followed
 
 @dataclass(frozen=True)
 class SensorDrive:
-    """Readings of one sensor, and the poses that go with them.
+    """A sensor as a calibration has it on a drive through a map.
 
     Attributes
     ----------
@@ -44,55 +45,99 @@ class SensorDrive:
         As recorded; what follows recorded numbers is taken off.
     trajectory
         The lidar's poses.
+    known
+        The calibration.
+    field_map
+        The map.
+    options
+        Of the solve: the loss, how long errors of poses last, how many readings are needed.
     """
 
     readings: Readings
     trajectory: Trajectory
+    known: KnownCalibration
+    field_map: QueryableMap
+    options: OneKeyOptions
 
-    def at(self, offset: float) -> Readings:
-        """Return the readings with their poses at a time offset in seconds."""
-        moved = with_offsets(self.readings, self.trajectory, np.array([offset]))
+    @cached_property
+    def timed(self) -> Readings:
+        """The readings with their poses at the time offset of the calibration."""
+        moved = with_offsets(self.readings, self.trajectory, self.known.vector[15:])
         # of a vehicle at rest nothing is known of its motion
         return moved if self.readings.motion is not None else replace(moved, motion=None)
 
+    @property
+    def places(self) -> FloatArray:
+        """Where the sensor was at them in the map in metres, shape (N, 3)."""
+        return np.asarray(self.timed.R_map_lidar @ self.known.vector[:3] + self.timed.p_map_lidar)
+
+    def inside(self) -> BoolArray:
+        """Return which readings lie inside the map, shape (N,)."""
+        return self.field_map.query(self.places).inside
+
+    def usable(self) -> BoolArray:
+        """Return those inside the map that one distortion explains beside the others, (N,)."""
+        sample = self.field_map.query(self.places)
+        within = sample.inside.copy()
+        rows = np.flatnonzero(within)
+        own = self.timed[rows]
+        wrong = ~plausible(own, sample.select(within), self.options.robust)
+        if wrong.any():
+            variance = sample.variance[rows].mean(axis=1)
+            e = residuals(own, self.field_map, self.known.estimate())
+            stretches = grown(wrong, e, median_noise(e, variance), variance)
+            # what would leave little to judge by is no stretch
+            wrong = stretches if 2 * (~stretches).sum() > (~wrong).sum() else wrong
+        within[rows[wrong]] = False
+        return within
+
+    def changed(self, change: FloatArray) -> "SensorDrive":
+        """Return the sensor after a change of its calibration, shape (16,)."""
+        return replace(
+            self, known=replace(self.known, vector=changed_vector(self.known.vector, change))
+        )
+
 
 @dataclass(frozen=True)
-class Recheck:
-    """A calibration, tested on a drive.
+class FollowedChange:
+    """Where a change was followed to.
 
     Attributes
     ----------
     likelihood
         Of a change in the coordinates of ``COLUMNS``, the calibration's own errors marginalised.
-    freedom
-        Degrees of freedom of the innovation, and of that of the parameters.
     parts
         That have changed, the plainest first.
     change, covariance
         Their coordinates, part by part.
     used
         Which readings count: inside the map, and explained beside the others, shape (N,).
-    spread
-        Covariance of the calibration, with wide variances for what it leaves open, shape (16, 16).
     """
 
     likelihood: ChangeLikelihood
-    freedom: tuple[int, int]
     parts: tuple[CalibrationPart, ...]
     change: FloatArray
     covariance: FloatArray
     used: BoolArray
+
+
+@dataclass(frozen=True)
+class Recheck(FollowedChange):
+    """A calibration, tested on a drive.
+
+    Attributes
+    ----------
+    freedom
+        Degrees of freedom of the innovation, and of that of the parameters.
+    spread
+        Covariance of the calibration, with wide variances for what it leaves open, shape (16, 16).
+    """
+
+    freedom: tuple[int, int]
     spread: FloatArray
 
 
-def recheck(
-    drive: SensorDrive,
-    field_map: QueryableMap,
-    known: KnownCalibration,
-    covariance: FloatArray,
-    options: OneKeyOptions,
-    chance: float,
-) -> Recheck:
+def recheck(drive: SensorDrive, covariance: FloatArray, chance: float) -> Recheck:
     """Test a calibration on a drive.
 
     A change is followed by Gauss-Newton steps from where it was found: a place that is off by
@@ -101,71 +146,46 @@ def recheck(
     Parameters
     ----------
     drive
-        Readings of the sensor.
-    known, covariance
-        The calibration; infinite variances for what it leaves open, shape (16, 16).
-    options
-        Of the solve: the loss, how long errors of poses last, how many readings are needed.
+        The sensor with its calibration.
+    covariance
+        Of the calibration; infinite variances for what it leaves open, shape (16, 16).
     chance
         Of calling a change what is none.
     """
-    spread, basis = finite(covariance, options), changes_of(known.vector[3:12].reshape(3, 3))
-    followed = _followed(drive, field_map, known, spread, options, chance)
+    spread = finite(covariance, drive.options)
+    followed = _followed(drive, spread, chance)
     likelihood, used = followed.likelihood, followed.used
     if followed.parts:
-        used = used & inside(drive, field_map, known)
-        if used.sum() < options.min_readings:
-            used = usable(drive, field_map, known, options)
-        likelihood = about(drive, field_map, known, used, options)
-        likelihood = marginalise_calibration(likelihood, spread, basis)
+        used = used & drive.inside()
+        if used.sum() < drive.options.min_readings:
+            used = drive.usable()
+        likelihood = _likelihood(drive, drive, NO_CHANGE, used, spread)
     # What is open takes a degree of freedom, unless readings do not depend on it, as on a clock
     # where motion is not known. (All depend on C, where coordinates are not the parameters.)
     matters = np.linalg.norm(likelihood.root, axis=0) > 0
     open_ = int(np.sum(~np.isfinite(np.diag(covariance)) & matters))
     freedom = 3 * int(used.sum()) - open_, int(matters.sum()) - open_
-    return Recheck(
-        likelihood, freedom, followed.parts, followed.change, followed.covariance, used, spread
-    )
+    change = followed.parts, followed.change, followed.covariance
+    return Recheck(likelihood, *change, used, freedom, spread)
 
 
-@dataclass(frozen=True)
-class _Followed:
-    """Where a change was followed to: its parts, their coordinates and the likelihood there."""
-
-    likelihood: ChangeLikelihood
-    parts: tuple[CalibrationPart, ...]
-    change: FloatArray
-    covariance: FloatArray
-    used: BoolArray
-
-
-def _followed(
-    drive: SensorDrive,
-    field_map: QueryableMap,
-    known: KnownCalibration,
-    spread: FloatArray,
-    options: OneKeyOptions,
-    chance: float,
-) -> _Followed:
-    C, change = known.vector[3:12].reshape(3, 3), NO_CHANGE
-    used = usable(drive, field_map, known, options)
-    last, here = np.empty(0), known
+def _followed(drive: SensorDrive, spread: FloatArray, chance: float) -> FollowedChange:
+    change, used = NO_CHANGE, drive.usable()
+    last, here = np.empty(0), drive
     parts: tuple[CalibrationPart, ...] = ()
     # Gauss-Newton: linearise about the changed calibration, test and estimate the change anew.
     for _ in range(ROUNDS):
-        basis = changes_of(C, change)
-        likelihood = about(drive, field_map, here, used, options).recentred(basis @ change)
-        likelihood = marginalise_calibration(likelihood, spread, basis)
+        likelihood = _likelihood(drive, here, change, used, spread)
         before, parts = parts, parts_changed(likelihood, 3 * int(used.sum()), chance)
         columns = columns_of(parts)
-        found = _Followed(likelihood, parts, *likelihood.estimate(columns), used)
+        found = FollowedChange(likelihood, parts, *likelihood.estimate(columns), used)
         if parts == before and _settled(found.change - last, found.covariance):
             break
         last = found.change
         change = limited(columns, found.change)
-        here = replace(known, vector=changed_vector(known.vector, change))
-        seen = usable(drive, field_map, here, options)
-        if seen.sum() < options.min_readings:
+        here = drive.changed(change)
+        seen = here.usable()
+        if seen.sum() < drive.options.min_readings:
             break
         used = seen
     return found
@@ -176,60 +196,22 @@ def _settled(step: FloatArray, covariance: FloatArray) -> bool:
     return bool((np.abs(step) <= SETTLED_SIGMAS * sigma).all())
 
 
-def about(
-    drive: SensorDrive,
-    field_map: QueryableMap,
-    here: KnownCalibration,
-    used: BoolArray,
-    options: OneKeyOptions,
+def _likelihood(
+    drive: SensorDrive, here: SensorDrive, change: FloatArray, used: BoolArray, spread: FloatArray
 ) -> ChangeLikelihood:
-    """Return the likelihood of a change of a calibration, linearised there."""
-    readings = drive.at(float(here.vector[15])).select(used)
-    return change_likelihood((readings,), field_map, (here,), options.pose_noise.lasting_s)
+    """Return the likelihood of a change of a calibration, linearised where it was followed to."""
+    basis, lasting_s = changes_of(drive.known.C, change), drive.options.pose_noise.lasting_s
+    readings = here.timed.select(used)
+    found = change_likelihood((readings,), drive.field_map, (here.known,), lasting_s)
+    return marginalise_calibration(found.recentred(basis @ change), spread, basis)
 
 
-def left_by(
-    found: Recheck,
-    drive: SensorDrive,
-    field_map: QueryableMap,
-    known: KnownCalibration,
-    options: OneKeyOptions,
-) -> float:
+def left_by(found: Recheck, drive: SensorDrive) -> float:
     """Return the squared innovation that the changes of a test do not explain."""
     columns = columns_of(found.parts)
     change = limited(columns, found.change)
-    here = replace(known, vector=changed_vector(known.vector, change))
-    basis = changes_of(known.vector[3:12].reshape(3, 3), change)
-    likelihood = about(drive, field_map, here, found.used, options).recentred(basis @ change)
-    likelihood = marginalise_calibration(likelihood, found.spread, basis)
+    likelihood = _likelihood(drive, drive.changed(change), change, found.used, found.spread)
     return likelihood.squared - likelihood.explained(columns)
-
-
-def inside(drive: SensorDrive, field_map: QueryableMap, known: KnownCalibration) -> BoolArray:
-    """Return which readings lie inside the map, shape (N,)."""
-    readings = drive.at(float(known.vector[15]))
-    places = readings.R_map_lidar @ known.vector[:3] + readings.p_map_lidar
-    return field_map.query(places).inside
-
-
-def usable(
-    drive: SensorDrive, field_map: QueryableMap, known: KnownCalibration, options: OneKeyOptions
-) -> BoolArray:
-    """Return the readings inside the map that one distortion explains beside the others, (N,)."""
-    readings = drive.at(float(known.vector[15]))
-    sample = field_map.query(readings.R_map_lidar @ known.vector[:3] + readings.p_map_lidar)
-    within = sample.inside.copy()
-    rows = np.flatnonzero(within)
-    own = readings[rows]
-    wrong = ~plausible(own, sample.select(within), options.robust)
-    if wrong.any():
-        variance = sample.variance[rows].mean(axis=1)
-        e = residuals(own, field_map, known.estimate())
-        stretches = grown(wrong, e, median_noise(e, variance), variance)
-        # what would leave little to judge by is no stretch
-        wrong = stretches if 2 * (~stretches).sum() > (~wrong).sum() else wrong
-    within[rows[wrong]] = False
-    return within
 
 
 def finite(covariance: FloatArray, options: OneKeyOptions) -> FloatArray:

@@ -7,16 +7,13 @@ from itertools import compress
 
 import numpy as np
 
-from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.data import BoolArray, Readings
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.validation import CalibrationPart, NotValidated, ValidatedSensor
 from l2m_gtsam.validation.drive_test import DriveTest, tested
-from l2m_gtsam.validation.figures import offset_s
 from l2m_gtsam.validation.innovation import estimate_of, together
 from l2m_gtsam.validation.places import AveragedBesideMap, is_searched
-from l2m_gtsam.validation.recheck import inside, usable
 
 
 @dataclass(frozen=True)
@@ -87,15 +84,10 @@ class TestedDrive:
         """The averaged drive if places are suspected on it, or sensors changed."""
         if not self.sensors:
             return None
-        given = self.test.field_map, self._estimate, self.test.options.changes
+        estimate = estimate_of([self.test.known(each) for each in self.calibrations])
+        given = self.test.field_map, estimate, self.test.options.changes
         averages = AveragedBesideMap.of(self._readings, *given)
         return averages if len(averages.places) or self.changed else None
-
-    @property
-    def _estimate(self) -> Estimate:
-        known = [self.test.known(each) for each in self.calibrations]
-        vectors = np.array([each.vector for each in known])
-        return estimate_of(vectors, np.array([each.noise for each in known]))
 
     @property
     def _readings(self) -> Readings:
@@ -108,15 +100,10 @@ class TestedDrive:
 
     def _counted(self) -> Iterator[tuple[Readings, BoolArray]]:
         """Yield the readings of each sensor that could be tested, and which of them count."""
-        options, field_map = self.test.options, self.test.field_map
-        searched = is_searched(field_map, options.changes)
+        searched = is_searched(self.test.field_map, self.test.options.changes)
         for each in self.calibrations:
-            drive, known = self.test.drive_of(each), self.test.known(each)
-            if searched:
-                counts = inside(drive, field_map, known)
-            else:
-                counts = usable(drive, field_map, known, options.solve)
-            yield drive.at(offset_s(each)), counts
+            drive = self.test.drive_of(each)
+            yield drive.timed, drive.inside() if searched else drive.usable()
 
 
 def parts_of(found: ValidatedSensor | NotValidated) -> tuple[CalibrationPart, ...]:

@@ -139,11 +139,8 @@ def validate(
 def _as_exchanged(drive: TestedDrive) -> TestedDrive:
     """Return a drive with the calibrations that readings are of."""
     test = drive.test
-    on_drive = [
-        TestedSensor(test.drive_of(one), test.known(one), each)
-        for one, each in zip(drive.calibrations, drive.sensors, strict=True)
-    ]
-    theirs = exchanged(on_drive, test.field_map)
+    pairs = zip(map(test.drive_of, drive.calibrations), drive.sensors, strict=True)
+    theirs = exchanged([TestedSensor(*each) for each in pairs])
     if not theirs:
         return drive
     of = {each.sensor: each for each in drive.known}

@@ -10,10 +10,11 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.data import FloatArray, joined_rows
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
-from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, hall_cloud, steel_hall
+from l2m_gtsam.simulate.steel_hall import MILD, SteelHall, steel_hall
 from l2m_gtsam.studies.honesty.cells import Outcomes
 from l2m_gtsam.studies.honesty.drives import drive_seed, start_near
 from l2m_gtsam.studies.honesty.summary import Consistency, consistency
+from tests.worlds.hall_clouds import CloudVariant, hall_cloud
 from tests.worlds.studied_maps import Build, Scene, StudiedMap
 
 START_M = 0.05  # each axis of a start is at most this far from the truth
@@ -184,7 +185,7 @@ def _outcomes(
         hall = steel_hall(seed, conditions.strength)
         surveyed = survey(hall, seed, heights, noise, conditions.survey_readings)
         field_map = case.build(Scene(surveyed, hall_cloud(hall, case.cloud, seed), hall))
-        span = conditions.sensor_span or surveyed.span
+        span = conditions.sensor_span or (min(heights), max(heights))
         for number, drive in enumerate(_drives(hall, conditions, seed, span, noise)):
             start = start_near(drive, seed, number, START_M)
             for method, calibrate in case.methods.items():
@@ -226,7 +227,7 @@ def _row(
     wanted: int,
 ) -> CalibrationRow:
     """Return the figures of a method under one condition."""
-    determined = outcomes.determined()
+    determined = outcomes[outcomes.determined_rows()]
     enough = determined.enough
     variances = np.diagonal(determined.covariance, axis1=1, axis2=2)
     blocks = determined.blocks

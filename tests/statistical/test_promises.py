@@ -15,7 +15,6 @@ from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive
-from l2m_gtsam.simulate.steel_hall import CloudVariant
 from l2m_gtsam.studies.honesty.drives import Condition, HonestyOptions
 from l2m_gtsam.studies.honesty.study import HONESTY
 from l2m_gtsam.studies.honesty.summary import TARGET, ConsistencyVerdict
@@ -28,6 +27,7 @@ from tests.drives.studied_calibrations import (
     independent,
     solved_by,
 )
+from tests.worlds.hall_clouds import CloudVariant
 from tests.worlds.studied_maps import (
     Build,
     MapCase,

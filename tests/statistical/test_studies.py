@@ -9,7 +9,7 @@ import pytest
 from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive
-from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, steel_hall
+from l2m_gtsam.simulate.steel_hall import MILD, SteelHall, steel_hall
 from l2m_gtsam.simulate.world import SteelWorld
 from tests.drives import studied_calibrations
 from tests.drives.studied_calibrations import (
@@ -20,6 +20,7 @@ from tests.drives.studied_calibrations import (
     independent,
 )
 from tests.worlds.exact import DipoleWorld, dipole_world
+from tests.worlds.hall_clouds import CloudVariant
 from tests.worlds.studied_maps import (
     NOISE_FACT,
     MapCase,

@@ -15,7 +15,7 @@ from l2m_gtsam.recording.sync import SyncOptions
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.records.validation import ValidatedSensor
 from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, calibration_drive, survey
-from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
+from l2m_gtsam.simulate.steel_hall import SteelHall, steel_hall
 from l2m_gtsam.validation.validate import validate
 
 pytestmark = pytest.mark.study
@@ -63,9 +63,7 @@ def _of_hall(seed: int, drives: int) -> list[Validated]:
 def surveyed(hall: SteelHall, seed: int, number: int) -> FieldMap:
     """Return the map of one of several surveys of a hall."""
     read = survey(hall, 1000 * number + seed, HEIGHTS, NOISE)
-    return build_map(
-        read.points, read.field, MapOptions(), hall_cloud(hall, CloudVariant.ACCURATE, seed)
-    )
+    return build_map(read.points, read.field, MapOptions(), hall.cloud())
 
 
 def along(hall: SteelHall, sensors: tuple[KnownSensor, ...], seed: int, number: int) -> Recording:

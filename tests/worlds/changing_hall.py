@@ -11,16 +11,13 @@ from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.simulate.hall_drives import (
     LANE_M,
-    STEP_NS,
     calibration_drive,
     driven,
     survey,
 )
 from l2m_gtsam.simulate.steel_hall import (
     HALF_AREA,
-    CloudVariant,
     SteelHall,
-    hall_cloud,
     steel_hall,
 )
 from l2m_gtsam.studies.changes.loads import (
@@ -114,7 +111,7 @@ class Warehouse:
         """Return the map of a survey, with what a LiDAR sees."""
         o = self.options
         read = survey(self.hall, seed, o.heights, o.noise, o.survey_readings)
-        seen = hall_cloud(self.bare, CloudVariant.ACCURATE, self.seed)
+        seen = self.bare.cloud()
         loads = [surface(o, self.places[k]) for k in sorted(self.loads)]
         return build_map(read.points, read.field, o.map, np.concatenate([seen, *loads]))
 
@@ -159,8 +156,7 @@ def patrol(hall: SteelHall, seed: int) -> Trajectory:
     curve[:, :, along] = s
     curve[1::2, :, along] = s[::-1]
     curve[:, :, 1 - along] = across[:, None]
-    path = driven(hall, curve.reshape(-1, 2))
-    return Trajectory(STEP_NS * np.arange(len(path.p)), path.R, path.p, "map", "lidar")
+    return driven(hall, curve.reshape(-1, 2))
 
 
 def rounds_end(options: ChangesStudyOptions, seed: int, rounds: int) -> RoundsEnd:

@@ -15,12 +15,11 @@ from l2m_gtsam.simulate.steel_hall import (
     HALF_AREA,
     MILD,
     STRONG,
-    CloudVariant,
     SteelHall,
-    hall_cloud,
     steel_hall,
 )
 from l2m_gtsam.studies.statistics import inside_interval
+from tests.worlds.hall_clouds import CloudVariant, hall_cloud
 
 # Of a map's summary.
 NOISE_FACT, VERDICT_FACT = "noise of a reading (uT)", "field"
@@ -239,7 +238,7 @@ def predict(
     hall = steel_hall(world, strength)
     surveyed = survey(hall, world, heights, conditions.noise, conditions.readings)
     field_map = build(Scene(surveyed, hall_cloud(hall, cloud, world), hall))
-    low, high = surveyed.span
+    low, high = min(heights), max(heights)
     truth = held_out(hall, world, (low - conditions.off_plane, high + conditions.off_plane))
     sample = field_map.query(truth.points)
     error = (sample.field - truth.field)[sample.inside]

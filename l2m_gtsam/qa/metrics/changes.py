@@ -179,6 +179,8 @@ def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float
     tests = {part.value: each.tested(part.value) for part, each in parts.items()}
     tests["C"] = whole.part(slice(3, 12)).tested("C")
     tests["all"] = whole.tested("all")
+    # A change of a part by itself shows in its own test, or in that of all.
+    basis = changes_of(old.distortion.C)[: len(whole.value)]
     return ComparedSensor(
         sensor=new.sensor,
         difference=row(np.where(whole.known, whole.value, np.nan), 9),
@@ -186,22 +188,16 @@ def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float
         tests=tuple(tests.values()),
         changes=_changes(parts, tests, least),
         detectable=tuple(
-            MinimumDetectableChange(part, _detectable(part, each, whole, old, least))
+            MinimumDetectableChange(
+                part,
+                min(
+                    each.detectable(least),
+                    whole.detectable_by_whole(basis[:, COLUMNS[part]], least),
+                ),
+            )
             for part, each in parts.items()
         ),
     )
-
-
-def _detectable(
-    part: CalibrationPart,
-    own: CalibrationDifference,
-    whole: CalibrationDifference,
-    old: SensorCalibration,
-    chance: float,
-) -> float:
-    """Return the smallest change of a part by itself that its test or that of all shows."""
-    basis = changes_of(old.distortion.C)[: len(whole.value), COLUMNS[part]]
-    return min(own.detectable(chance), whole.detectable_by_whole(basis, chance))
 
 
 def differences(

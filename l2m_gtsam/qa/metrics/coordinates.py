@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import expm, expm_frechet, polar
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.qa.metrics.mounting import PAIRS
 from l2m_gtsam.records.validation import CalibrationPart
 
 PARAMETERS = 16  # t, C row by row, H, time offset
@@ -21,7 +22,6 @@ COLUMNS = {
     CalibrationPart.OFFSET: slice(12, 15),
     CalibrationPart.CLOCK: slice(15, 16),
 }
-PAIRS = ((0, 1), (1, 2), (2, 0))
 
 
 def changes_of(C: FloatArray, change: FloatArray = NO_CHANGE) -> FloatArray:

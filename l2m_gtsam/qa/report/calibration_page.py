@@ -27,12 +27,11 @@ from l2m_gtsam.qa.report.page import (
 )
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.calibration import Measured, judge, measured
-from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, place_of, stretch_head
+from l2m_gtsam.qa.verdict.places import stretch_head
 from l2m_gtsam.qa.verdict.uncertainty import shares_in_words, what_helps
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import Metrics, SensorMetrics
 from l2m_gtsam.records.verdict import SensorVerdict
-from l2m_gtsam.solve.rank import PARAMETERS
 from l2m_gtsam.storage.calibration_file import MODEL, UNCERTAINTY, calibration_content
 from l2m_gtsam.storage.yaml_file import yaml_text
 
@@ -138,16 +137,11 @@ def calibration_page(
             found=[each for each in result.sensors if np.isfinite(each.t_lidar_mag).all()],
             pictures=pictures(figures),
             sections=sections,
-            length=np.linalg.norm,
-            what_else=best_of,
-            cause=cause_in_short,
-            place=place_of,
             cause_of_stretch=stretch_head,
             shares=shares_in_words,
             what_helps=what_helps,
             strongest_correlation=statistics.strongest_correlation,
             thresholds=thresholds(options),
-            parameters=PARAMETERS,
             repeatability="" if options.halves else " Not judged (qa.halves).",
             uncertainty=UNCERTAINTY[result.uncertainty],
             model=MODEL,
@@ -159,9 +153,7 @@ def calibration_page(
 def _figures(sensor: SensorCalibration, found: SensorMetrics) -> dict[str, Figure | Drawing]:
     """Return the figures of a sensor by their keys."""
     figures: dict[str, Figure | Drawing] = {
-        "curves": readings.curves_figure(found.series),
-        "residuals": readings.residuals_figure(found.series),
-        "place": map_figures.residual_figure(found.series),
+        **readings.series_figures(found.series),
         "chi2": statistics.chi_square_figure(found.normalised),
         "auto": statistics.autocorrelation_figure(found),
         "directions": readings.directions_figure(found),

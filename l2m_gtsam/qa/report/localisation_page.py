@@ -11,13 +11,11 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.figures import localisation as drive_figures
 from l2m_gtsam.qa.report.figures import readings, statistics
-from l2m_gtsam.qa.report.figures.map import residual_figure
 from l2m_gtsam.qa.report.page import Identity, Picture, pictures, render
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.localisation import judge_localisation, localisation_thresholds
 from l2m_gtsam.records.localisation_file import LocalisationRecord, RefinedSensor, SensorRecord
 from l2m_gtsam.records.verdict import SensorVerdict
-from l2m_gtsam.solve.rank import PARAMETERS
 from l2m_gtsam.storage.yaml_file import yaml_text
 
 
@@ -76,7 +74,6 @@ def localisation_page(record: LocalisationRecord, options: QaOptions, identity: 
             pictures=figures,
             sections=sections,
             thresholds=localisation_thresholds(options),
-            parameters=PARAMETERS,
             options=yaml_text(record.options, ""),
         )
 
@@ -103,12 +100,8 @@ def _section(
     figures: dict[str, Figure | Drawing] = {}
     series, normalised = sensor.series, sensor.normalised
     if series is not None and normalised is not None:
-        figures = {
-            "curves": readings.curves_figure(series),
-            "residuals": readings.residuals_figure(series),
-            "chi2": statistics.chi_square_figure(normalised),
-            "place": residual_figure(series),
-        }
+        figures = readings.series_figures(series)
+        figures["chi2"] = statistics.chi_square_figure(normalised)
     if refined is not None:
         change = tuple(np.subtract(refined.after, refined.before))
         label = "change (sigmas of before)"

@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, SourceFile
 from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.svg import as_svg
+from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, place_of
 from l2m_gtsam.records.record import Row
+from l2m_gtsam.solve.rank import PARAMETERS
 from l2m_gtsam.storage.report_id import SHOWN
 from l2m_gtsam.text import (
     by_sigma,
@@ -160,6 +162,13 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.tests["finite"] = math.isfinite
+    environment.globals |= {
+        "parameters": PARAMETERS,
+        "length": np.linalg.norm,
+        "what_else": best_of,
+        "cause": cause_in_short,
+        "place": place_of,
+    }
     environment.filters |= {
         "code": code,
         "number": significant,

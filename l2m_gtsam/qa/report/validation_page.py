@@ -15,7 +15,6 @@ from l2m_gtsam.qa.report.figures.statistics import sigmas_figure
 from l2m_gtsam.qa.report.page import Identity, Picture, pictures, render
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.changed_parts import NAMES, amount
-from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, place_of
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.validation import (
     CalibrationPart,
@@ -26,7 +25,6 @@ from l2m_gtsam.records.validation import (
     Validation,
 )
 from l2m_gtsam.records.verdict import SensorVerdict
-from l2m_gtsam.solve.rank import PARAMETERS
 
 
 @dataclass(frozen=True)
@@ -75,11 +73,6 @@ def validation_page(found: Validation, identity: Identity) -> str:
             pictures={} if found.drive is None else pictures(_figures(found.drive)),
             shifts="" if found.drive is None else _detectable_shifts(found.drive),
             thresholds=found.thresholds,
-            parameters=PARAMETERS,
-            length=np.linalg.norm,
-            what_else=best_of,
-            cause=cause_in_short,
-            place=place_of,
         )
 
 
@@ -106,11 +99,7 @@ def _section(index: int, verdict: SensorVerdict, found: Validation) -> Validatio
     compared = next((each for each in both if each.sensor == verdict.sensor), None)
     figures: dict[str, Figure | Drawing] = {}
     if tested is not None:
-        figures = {
-            "curves": readings.curves_figure(tested.series),
-            "residuals": readings.residuals_figure(tested.series),
-            "place": map_figures.residual_figure(tested.series),
-        }
+        figures = readings.series_figures(tested.series)
     if compared is not None:
         label = "new less old (sigmas)"
         figures["change"] = sigmas_figure(compared.difference, compared.sigma, label)

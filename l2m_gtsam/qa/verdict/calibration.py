@@ -1,7 +1,7 @@
 """The verdict on a calibration: PASS, WARN or FAIL, with reasons in plain sentences."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.verdict.mounting import mounting
 from l2m_gtsam.qa.verdict.places import source_reasons, stretch_head, stretch_tail
+from l2m_gtsam.qa.verdict.reasons import failure, note, warning
 from l2m_gtsam.qa.verdict.repeatability import furthest_shown, moved, repeat
 from l2m_gtsam.qa.verdict.sensor import (
     WRONG_MAP,
@@ -106,7 +107,7 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
     reasons += [Reason(Level.WARN, _changed(each, result)) for each in shared[:MANY]]
     if len(shared) > MANY:
         more = f"The place differs from the map along {len(shared) - MANY} more stretches."
-        reasons.append(Reason(Level.WARN, more))
+        reasons += warning(more)
     # A map of another place is no evidence on this one.
     reasons += disturbance_reasons(result, None)
     reasons += _beside_moved(cases) or stated_wrongly(result.stated, None, result.pose_duration)
@@ -119,11 +120,10 @@ def _beside_moved(cases: tuple[Case, ...]) -> list[Reason]:
     names = [case.sensor.sensor for case in cases if misfit(case) and moved(case)]
     if not names:
         return []
-    text = (
+    return warning(
         f"Sigmas of all sensors are larger by what {', '.join(names)} leaves: calibrate the drives "
         "apart, or leave it out (`bag.fields`)."
     )
-    return [Reason(Level.WARN, text)]
 
 
 def _of_its_survey(result: CalibrationResult) -> list[Reason]:
@@ -132,11 +132,10 @@ def _of_its_survey(result: CalibrationResult) -> list[Reason]:
     surveyed = {each.sha256 for each in sources}
     if not (own := [each.path for each in result.drives if each.sha256 in surveyed]):
         return []
-    text = (
+    return warning(
         f"The map was made from {', '.join(own)}: noise is in both, and sensors that surveyed come "
         "out as they were assumed, right or wrong; calibrate on another drive."
     )
-    return [Reason(Level.WARN, text)]
 
 
 def _old_map(result: CalibrationResult, options: QaOptions) -> list[Reason]:
@@ -144,11 +143,10 @@ def _old_map(result: CalibrationResult, options: QaOptions) -> list[Reason]:
     limit, age = options.map_days, result.map_age_days
     if limit is None or age is None or age <= limit:
         return []
-    text = (
+    return warning(
         f"The map was {age:.3g} days old at the drive, more than the {limit:g} of `qa.map_days`: "
         "steel may have changed since; survey the place again."
     )
-    return [Reason(Level.WARN, text)]
 
 
 def _exact(result: CalibrationResult) -> list[Reason]:
@@ -156,23 +154,21 @@ def _exact(result: CalibrationResult) -> list[Reason]:
     reasons = []
     if (lasting := result.pose_duration) and lasting.source is DurationSource.FOUND:
         text = f"Errors of poses last {significant(lasting.seconds, 2)} s, by the readings."
-        reasons.append(Reason(Level.PASS, text))
+        reasons += note(text)
     found = [each.drive_noise for each in result.sensors if each.drive_noise]
     if 2 * len(found) > len(result.sensors):  # of one alone it may have been moved
         sizes = zip(result.bags, np.median(found, axis=0).tolist(), strict=True)
         each = ", ".join(f"{significant(size, 2)} µT in {bag.path}" for bag, size in sizes)
         text = f"Noise differs between drives: {each}. Each reading counts with that of its own."
-        reasons.append(Reason(Level.PASS, text))
+        reasons += note(text)
     if size := result.unseen_warp_m:
-        text = (
+        reasons += note(
             f"The drive's frame may be bent against the map's by {1e3 * size:.1f} mm: the readings "
             "would not show it. Sigmas include it."
         )
-        reasons.append(Reason(Level.PASS, text))
     if result.exact:
         common = f" {COMMON}" if "the survey's sensors" in result.exact else ""
-        text = f"Taken as exact: {', '.join(result.exact)}.{common}"
-        reasons.append(Reason(Level.PASS, text))
+        reasons += note(f"Taken as exact: {', '.join(result.exact)}.{common}")
     return reasons
 
 
@@ -185,7 +181,7 @@ def _wrong_map(cases: tuple[Case, ...]) -> list[Reason]:
     ]
     if not known or not all(map(misfit, known)):
         return []
-    return [Reason(Level.FAIL, WRONG_MAP)]
+    return failure(WRONG_MAP)
 
 
 def _bent_too_far(cases: tuple[Case, ...], result: CalibrationResult) -> list[Reason]:
@@ -194,11 +190,10 @@ def _bent_too_far(cases: tuple[Case, ...], result: CalibrationResult) -> list[Re
     size = max((each.sizes["shift_m"] for each in warps), default=0.0)
     if not cases or size <= cases[0].options.warp_m:
         return []
-    text = (
+    return failure(
         f"The drive fits the map only if its frame is bent by {size:.2g} m, more than a frame of "
         "one place is (`qa.warp_m`). Is it the map of this place, and are the poses in its frame?"
     )
-    return [Reason(Level.FAIL, text)]
 
 
 def _on_drive(cases: tuple[Case, ...]) -> list[Reason]:
@@ -208,17 +203,15 @@ def _on_drive(cases: tuple[Case, ...]) -> list[Reason]:
     drive, options = cases[0].all.drive, cases[0].options
     reasons = []
     if drive.length < options.short_drive_m:
-        text = (
+        reasons += warning(
             f"The drive is short, {drive.length:.1f} m in {drive.seconds:.0f} s: drive on, through "
             "more places and headings."
         )
-        reasons.append(Reason(Level.WARN, text))
     if drive.heading < options.few_headings:
-        text = (
+        reasons += warning(
             f"The vehicle took {drive.heading:.0%} of all headings only, much of a straight line: "
             "drive curves and loops in both directions."
         )
-        reasons.append(Reason(Level.WARN, text))
     return reasons
 
 
@@ -249,12 +242,11 @@ def _own_stretches(case: Case) -> list[Reason]:
     if not own:
         return []
     readings = sum(each.readings for each in own)
-    text = (
+    return warning(
         f"Along {len(own)} stretch{'es' if len(own) > 1 else ''} of the drive ({readings} "
         "readings) it alone disagrees with the map, other sensors do not: something near it was "
         "switched or moved."
     )
-    return [Reason(Level.WARN, text)]
 
 
 def _is_shared(stretch: Disagreement, result: CalibrationResult) -> bool:
@@ -284,7 +276,7 @@ def _lower_bounds(case: Case) -> list[Reason]:
     full = case.result.uncertainty is not Uncertainty.INDEPENDENT
     if full or case.metrics is None or not case.metrics.fit.map_noise:
         return []
-    return [Reason(Level.WARN, LOWER_BOUNDS)]
+    return warning(LOWER_BOUNDS)
 
 
 # In the order in which a person would ask; the worst come first in the end.
@@ -328,7 +320,7 @@ class Measured:
     value: float
     warn: float
     fail: float
-    passes: str = ""
+    passes: str
 
     @property
     def level(self) -> Level:
@@ -352,31 +344,25 @@ def measured(
     turned = np.rad2deg(np.sqrt(np.diag(sensor.rotation_covariance)))
     chi2 = np.nan if sensor.residuals is None else sensor.residuals.chi2_per_dof
     apart, passes = furthest_shown(found.halves, options)
+    outside = _share(sensor.outside_map, sensor.inside + sensor.outside_map)
     every = (
         _in("sigma of t", "mm", _largest(sensor.t_sigma), options.position_sigma_m, 1e3),
         _in("sigma of rotation", "°", _largest(turned), options.rotation_sigma_deg),
         _in("sigma of H", "µT", _largest(sensor.H_sigma), options.hard_iron_sigma_ut),
         _in("unexplained by the map", "", found.fit.unexplained, options.unexplained),
         _in("chi-square", "", chi2, options.chi_square),
-        replace(
-            _in("halves apart, over what chance allows", "", apart, options.halves_apart),
-            passes=passes,
-        ),
+        _in("halves apart, over what chance allows", "", apart, options.halves_apart, 1.0, passes),
         _in("rejected", "%", _share(sensor.rejected, sensor.inside), options.rejected, 100),
-        _in(
-            "outside the map",
-            "%",
-            _share(sensor.outside_map, sensor.inside + sensor.outside_map),
-            options.outside_map,
-            100,
-        ),
+        _in("outside the map", "%", outside, options.outside_map, 100),
         _in("beyond the range", "%", _beyond_range(sensor), options.saturated, 100),
     )
     return tuple(each for each in every if not np.isnan(each.value))
 
 
-def _in(name: str, unit: str, value: float, limit: Limit, factor: float = 1.0) -> Measured:
-    return Measured(name, unit, factor * value, factor * limit.warn, factor * limit.fail)
+def _in(
+    name: str, unit: str, value: float, limit: Limit, factor: float = 1.0, passes: str = ""
+) -> Measured:
+    return Measured(name, unit, factor * value, factor * limit.warn, factor * limit.fail, passes)
 
 
 def _largest(sigmas: FloatArray) -> float:

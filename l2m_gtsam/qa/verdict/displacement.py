@@ -5,6 +5,7 @@ import numpy as np
 from l2m_gtsam.qa.metrics.changes import change_of
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.changed_parts import amount, limits_of, size_and_parts
+from l2m_gtsam.qa.verdict.reasons import warning
 from l2m_gtsam.records.validation import (
     CalibrationChange,
     CalibrationPart,
@@ -52,7 +53,7 @@ def _blind_to_shifts(drive: DriveValidation, options: QaOptions) -> list[Reason]
     if not hidden:
         return []
     text = f"This drive cannot rule out a shift by {amount(CalibrationPart.PLACE, limit)} {hidden}."
-    return [Reason(Level.WARN, text)]
+    return warning(text)
 
 
 def moved_with_all(drive: DriveValidation, options: QaOptions) -> list[Reason]:

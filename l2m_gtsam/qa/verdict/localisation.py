@@ -7,6 +7,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.metrics.trajectory import HEADING, LocalisedTrajectory, localised_trajectory
 from l2m_gtsam.qa.options import Limit, QaOptions, SlamQaOptions, thresholds
+from l2m_gtsam.qa.verdict.reasons import failure, note, warning
 from l2m_gtsam.qa.verdict.sensor import outside_map
 from l2m_gtsam.records.localisation import (
     LocalisationStatus,
@@ -87,9 +88,9 @@ def _shared_reasons(record: LocalisationRecord, options: SlamQaOptions) -> list[
         *(Reason(Level.WARN, f"{each.rstrip('.')}.") for each in record.notes),
         *_sigmas(record),
         *(Reason(Level.PASS, each) for each in record.hints),
-        _drift(record),
-        *([] if record.scale is None else [_scale(record.scale)]),
-        *([] if record.turn is None else [_turn(record.turn)]),
+        *_drift(record),
+        *([] if record.scale is None else _scale(record.scale)),
+        *([] if record.turn is None else _turn(record.turn)),
     ]
 
 
@@ -98,18 +99,17 @@ def _ending(record: LocalisationRecord) -> list[Reason]:
     if record.status is LocalisationStatus.LOCALISED:
         return []
     if record.status is LocalisationStatus.NOT_CONVERGED:
-        text = (
+        return failure(
             f"The solve did not converge ({message}): errors of poses may exceed their standard "
             "deviations. Allow more steps with slam.max_iterations."
         )
-        return [Reason(Level.FAIL, text)]
-    return [Reason(Level.FAIL, f"{message[:1].upper()}{message[1:]}.")]
+    return failure(f"{message[:1].upper()}{message[1:]}.")
 
 
 def _precision(path: LocalisedTrajectory, options: SlamQaOptions) -> list[Reason]:
     """Return where poses are not known well."""
     if not np.isfinite(path.sigma).all():
-        return [Reason(Level.WARN, "The uncertainty of the poses is not known.")]
+        return warning("The uncertainty of the poses is not known.")
     position, heading = path.position_sigma, path.heading_sigma
     least, widest = options.position_sigma_m, options.heading_sigma_deg
     return [
@@ -148,11 +148,10 @@ def _start(path: LocalisedTrajectory, options: SlamQaOptions) -> list[Reason]:
     # Distance and angle are of three coordinates each: chi-square of six.
     if chance_beyond(squared, POSE_FREEDOM) >= options.chance:
         return []
-    text = (
+    return warning(
         f"The drive begins {path.apart[0]:.2f} m and {path.turned[0]:.1f}° from the given start, "
         "more than slam.start allows: a wrong start, or a map or calibration that is off."
     )
-    return [Reason(Level.WARN, text)]
 
 
 def _steps(record: LocalisationRecord, options: SlamQaOptions) -> list[Reason]:
@@ -185,15 +184,15 @@ def _truth(truth: TruthRecord, options: SlamQaOptions) -> list[Reason]:
     if after > before:
         # Odometry has not drifted yet at the start, if that is known.
         text = f"Against the truth, localising made the error of the position larger: {errors}."
-        first = Reason(Level.WARN, text)
+        first = warning(text)
     else:
         text = f"Against the truth, {truth.removed:.0%} of odometry's error is gone: {errors}."
-        first = Reason(Level.PASS, text)
+        first = note(text)
     text = (
         f"Against the truth, errors of the poses are {truth.nees_ratio**0.5:.1f} times their "
         f"standard deviations (NEES {truth.nees:.1f}; consistent: expected {POSE_FREEDOM})."
     )
-    return [first, *options.nees.reasons(truth.nees_ratio, text)]
+    return [*first, *options.nees.reasons(truth.nees_ratio, text)]
 
 
 def _changed(record: LocalisationRecord, path: LocalisedTrajectory) -> list[Reason]:
@@ -202,15 +201,13 @@ def _changed(record: LocalisationRecord, path: LocalisedTrajectory) -> list[Reas
     reasons = []
     for start, end in found[:MANY]:
         here, there = ("({:.1f}, {:.1f})".format(*path.place_at(each)) for each in (start, end))
-        text = (
+        reasons += warning(
             f"From {start:.0f} to {end:.0f} s, between {here} and {there} m, most "
             "readings of all sensors fit no place where the vehicle can have been: the place "
             "has changed since it was mapped, or something passed by."
         )
-        reasons.append(Reason(Level.WARN, text))
     if len(found) > MANY:
-        more = f"The same is true of {len(found) - MANY} more stretches."
-        reasons.append(Reason(Level.WARN, more))
+        reasons += warning(f"The same is true of {len(found) - MANY} more stretches.")
     return reasons
 
 
@@ -237,51 +234,46 @@ def _sigmas(record: LocalisationRecord) -> list[Reason]:
     """Return what standard deviations leave out."""
     reasons = []
     if not record.map_errors_shared:
-        text = (
+        reasons += warning(
             "This kind of map does not state how its errors are correlated: they count as each "
             "reading's own, and standard deviations come out too small. A harmonic map states it."
         )
-        reasons.append(Reason(Level.WARN, text))
     if not record.refined:
-        text = (
+        reasons += note(
             "The calibration is fixed (`slam.calibration`): its own sigmas, stated or assumed, are "
             "not in those of the poses."
         )
-        reasons.append(Reason(Level.PASS, text))
     return reasons
 
 
-def _drift(record: LocalisationRecord) -> Reason:
+def _drift(record: LocalisationRecord) -> list[Reason]:
     drift = record.drift
-    text = (
+    return note(
         f"Odometry alone would have ended {drift.end_m:.2f} m and {drift.end_deg:.1f}° from the "
         f"localised poses, {drift.end_share:.1%} of the path."
     )
-    return Reason(Level.PASS, text)
 
 
-def _scale(scale: OdometryScale) -> Reason:
-    text = (
+def _scale(scale: OdometryScale) -> list[Reason]:
+    return note(
         f"Distances are {with_sigma(100 * abs(scale.longer), 100 * scale.sigma, '%')} (1 sigma) "
         f"{'longer' if scale.longer >= 0 else 'shorter'} than odometry's."
     )
-    return Reason(Level.PASS, text)
 
 
-def _turn(turn: OdometryTurn) -> Reason:
-    text = (
+def _turn(turn: OdometryTurn) -> list[Reason]:
+    return note(
         f"Odometry turns by {with_sigma(abs(turn.left_deg_per_m), turn.sigma, 'deg')} (1 sigma) "
         f"per metre too far to the {'left' if turn.left_deg_per_m >= 0 else 'right'}, all along "
         "the drive."
     )
-    return Reason(Level.PASS, text)
 
 
 def _counted(sensor: SensorRecord, options: QaOptions) -> list[Reason]:
     """Return which readings of a sensor do not count, and how the others fit."""
     use = sensor.use
     if not use.used:
-        return [Reason(Level.FAIL, f"None of its {use.readings:,} readings counts.")]
+        return failure(f"None of its {use.readings:,} readings counts.")
     inside = use.readings - use.outside_map
     wrong, lost = use.rejected / inside, use.outside_map / use.readings
     return [
@@ -308,9 +300,8 @@ def _refined(refined: RefinedSensor | None, options: SlamQaOptions) -> list[Reas
     change = refined.change
     if chance_beyond(change.value, change.freedom) >= options.chance:
         return []
-    text = (
+    return warning(
         f"Refining it changed it by more than its standard deviations allow ({change.value:.0f} "
         f"for {change.freedom} parameters, normalised and squared): it has changed since it was "
         "calibrated, or its covariance was too small."
     )
-    return [Reason(Level.WARN, text)]

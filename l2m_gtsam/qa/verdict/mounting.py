@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.reasons import failure, note, warning
 from l2m_gtsam.qa.verdict.sensor import Case
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, SensorStatus
 from l2m_gtsam.records.metrics import AxisOrder
-from l2m_gtsam.records.verdict import Level, Reason
+from l2m_gtsam.records.verdict import Reason
 
 NOT_SOLVED = (SensorStatus.NO_READINGS, SensorStatus.OUTSIDE_MAP)
 
@@ -31,11 +32,10 @@ def _place(case: Case) -> list[Reason]:
         return []
     roughly = rough_place(sensor.sensor, case.result, options)
     if roughly is not None and (other := _swapped_with(case, roughly)):
-        text = (
+        return failure(
             f"It is where {other} should be, and {other} is where it should be: the two are "
             "swapped. Exchange their topics or their cables."
         )
-        return [Reason(Level.FAIL, text)]
     meant = nominal_place(sensor.sensor, case.result, options)
     if meant is None:
         return []
@@ -86,16 +86,15 @@ def _turn(case: Case) -> list[Reason]:
         return options.nominal_deg.reasons(off, text)
     if found.axes.usual or found.axes.off_deg > options.axes_deg or found.axes.mirrored:
         return []
-    return [_unexpected(case.sensor.sensor, found.axes, along)]
+    return _unexpected(case.sensor.sensor, found.axes, along)
 
 
-def _unexpected(sensor: str, order: AxisOrder, along: str) -> Reason:
+def _unexpected(sensor: str, order: AxisOrder, along: str) -> list[Reason]:
     swapped = "exchanged" if any(a[1] != n for a, n in zip(order.along, "xyz", strict=True)) else ""
     what = f"Its axes are {swapped}" if swapped else "Two of its axes are reversed"
-    return Reason(
-        Level.WARN,
+    return warning(
         f"{what}: {along}. Its driver mixes axes: `bag.axes: {{{sensor}: {order.in_order}}}` puts "
-        "them in order. Or it is mounted like this: then state it in `qa.nominal`.",
+        "them in order. Or it is mounted like this: then state it in `qa.nominal`."
     )
 
 
@@ -119,14 +118,11 @@ def _hard_iron(case: Case) -> list[Reason]:
     if strength < case.options.hard_iron_ut:
         return []
     x, y, z = case.sensor.distortion.H
-    return [
-        Reason(
-            Level.PASS,
-            f"Strong hard iron: H = ({x:.1f}, {y:.1f}, {z:.1f}) µT, {strength:.0f} µT together, as "
-            "of a magnet on the vehicle near the sensor. It is calibrated; keep the magnet where "
-            "it is, or calibrate again.",
-        )
-    ]
+    return note(
+        f"Strong hard iron: H = ({x:.1f}, {y:.1f}, {z:.1f}) µT, {strength:.0f} µT together, as "
+        "of a magnet on the vehicle near the sensor. It is calibrated; keep the magnet where "
+        "it is, or calibrate again."
+    )
 
 
 def check_names(sensors: Sequence[str], options: QaOptions) -> None:

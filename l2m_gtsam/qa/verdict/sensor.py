@@ -7,6 +7,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, SaturatedAxis
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.reasons import failure, warning
 from l2m_gtsam.qa.verdict.uncertainty import moves
 from l2m_gtsam.recording.saturation import saturation_sentence
 from l2m_gtsam.records.calibration import (
@@ -90,7 +91,7 @@ def unconverged(case: Case) -> list[Reason]:
     if sensor.status is not SensorStatus.NOT_CONVERGED:
         return []
     head = OPEN_HEAD if sensor.undetermined else "The solve did not converge"
-    return [Reason(Level.FAIL, _sentence(head, sensor.message))]
+    return failure(_sentence(head, sensor.message))
 
 
 def ending(case: Case) -> list[Reason]:
@@ -105,18 +106,17 @@ def ending(case: Case) -> list[Reason]:
         level = Level.WARN if known and turned else Level.FAIL
         return [Reason(level, _sentence(OPEN_HEAD, sensor.message))]
     if sensor.status is SensorStatus.FLIPPED_AXIS and (swapped := _swapped_axes(case)):
-        return [swapped]
+        return swapped
     if sensor.status is SensorStatus.CONTRADICTED:
         if fits_elsewhere(case.others, case.options):
-            text = (
+            return failure(
                 f"{sensor.rejected} of its readings fit no calibration that explains the others, "
                 "while other sensors fit the map: something about this sensor changed on the drive."
             )
-            return [Reason(Level.FAIL, text)]
         if sensor.rejected:
             head = "Its readings contradict the map or what is known"
-            return [Reason(Level.FAIL, _sentence(head, sensor.message))]
-    return [Reason(Level.FAIL, _sentence(HEADS[sensor.status], sensor.message))]
+            return failure(_sentence(head, sensor.message))
+    return failure(_sentence(HEADS[sensor.status], sensor.message))
 
 
 def fits_elsewhere(others: Sequence[SensorMetrics], options: QaOptions) -> bool:
@@ -129,20 +129,19 @@ def _sentence(head: str, message: str) -> str:
     return f"{head}: {message}" + ("" if message.endswith((".", "?")) else ".")
 
 
-def _swapped_axes(case: Case) -> Reason | None:
+def _swapped_axes(case: Case) -> list[Reason]:
     """Return which two axes are swapped, where two are; a single reversed one has its message."""
     found = None if case.metrics is None else case.metrics.mounting.axes
     if found is None or not found.mirrored:
-        return None
+        return []
     moved = [k for k in range(3) if found.along[k][1] != "xyz"[k]]
     if len(moved) != 2 or any(found.along[k][0] == "-" for k in moved):
-        return None
+        return []
     one, two = ("xyz"[k] for k in moved)
-    return Reason(
-        Level.FAIL,
+    return failure(
         f"Axes {one} and {two} are swapped: {one} reads along the lidar's {found.along[moved[0]]}, "
         f"{two} along its {found.along[moved[1]]}, which no mounting does; exchange them in the "
-        f"driver, or with `bag.axes: {{{case.sensor.sensor}: {found.in_order}}}`.",
+        f"driver, or with `bag.axes: {{{case.sensor.sensor}: {found.in_order}}}`."
     )
 
 
@@ -257,11 +256,10 @@ def _unmodelled(case: Case) -> list[Reason]:
     if not named:
         return []
     cause = OF_MOTION if moves(case.result, case.sensor.sensor) else OF_OTHERS
-    text = (
+    return warning(
         "Parts of the drive disagree by more than noise, map and poses explain: its sigmas are "
         f"larger by what is unmodelled ({', '.join(named)}). {cause}"
     )
-    return [Reason(Level.WARN, text)]
 
 
 def _correlated(case: Case) -> list[Reason]:
@@ -273,8 +271,7 @@ def _correlated(case: Case) -> list[Reason]:
     # N correlated readings carry the information of N_eff independent ones: sigmas that count N
     # are too small by sqrt(N / N_eff).
     times = (case.metrics.fit.readings / found.independent) ** 0.5
-    text = (
+    return warning(
         f"Errors of neighbouring readings are correlated ({found.next:.2f}), but its sigmas count "
         f"each by itself: they are too small, by about {times:.1f} times."
     )
-    return [Reason(Level.WARN, text)]

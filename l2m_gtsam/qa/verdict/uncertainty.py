@@ -146,15 +146,6 @@ PARTS = {
 }
 
 
-CAUSES = {
-    DisturbanceKind.WANDER: ErrorCause.WANDER,
-    DisturbanceKind.POSES: ErrorCause.POSES,
-    DisturbanceKind.FIELD: ErrorCause.FIELD,
-    DisturbanceKind.WARP: ErrorCause.WARP,
-    DisturbanceKind.CLOCK: ErrorCause.CLOCK,
-    DisturbanceKind.SMOOTHING: ErrorCause.SMOOTHING,
-    DisturbanceKind.MOVING_PARTS: ErrorCause.MOVING_PARTS,
-}
 MATTERS = 0.1  # of a variance: what has less of it adds 5 % to a sigma at most
 # What stands for numbers that were not recorded follows them by and large only: what it misses is
 # no more than itself. Of a sigma of H, that adds half a percent.
@@ -220,12 +211,13 @@ def _share(found: Disturbance, result: CalibrationResult) -> float:
     sensors = [each for each in result.sensors if found.sensor in (None, each.sensor)]
     if not any(each.variance_shares for each in sensors):
         return 1.0
+    cause = ErrorCause(found.kind.value)  # what a process disturbs has its name
     return max(
         (
             max(share.t, share.C, share.H)
             for each in sensors
             for share in each.variance_shares
-            if share.cause is CAUSES[found.kind]
+            if share.cause is cause
         ),
         default=0.0,
     )

@@ -15,6 +15,7 @@ from l2m_gtsam.qa.verdict.changed_parts import (
 )
 from l2m_gtsam.qa.verdict.displacement import displaced, moved_with_all
 from l2m_gtsam.qa.verdict.places import source_reasons
+from l2m_gtsam.qa.verdict.reasons import failure, note, warning
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, beyond_range, outside_map
 from l2m_gtsam.qa.verdict.uncertainty import jump_sentence
 from l2m_gtsam.records.error_budget import MOST_JUMPS, OffsetDrift
@@ -64,14 +65,12 @@ def judge_validation(
             )
         _add_missing(found, drive.missing)
     if comparison is not None:
-        shared.append(Reason(Level.PASS, comparison.assumption))
+        shared += note(comparison.assumption)
         if comparison.same_bag:
-            shared.append(Reason(Level.WARN, "One drive took part in both calibrations."))
+            shared += warning("One drive took part in both calibrations.")
         for name in comparison.failed:
-            warning = (
-                f"The {name} calibration itself was judged FAIL: its calibration.yaml says why."
-            )
-            shared.append(Reason(Level.WARN, warning))
+            text = f"The {name} calibration itself was judged FAIL: its calibration.yaml says why."
+            shared += warning(text)
         for each in comparison.sensors:
             found.setdefault(each.sensor, []).extend(_on_comparison(each, options))
         _add_missing(found, comparison.missing)
@@ -92,7 +91,7 @@ def _add_missing(found: dict[str, list[Reason]], missing: tuple[NotValidated, ..
 def _on_drive(drive: DriveValidation, options: QaOptions) -> list[Reason]:
     """Return what concerns all sensors."""
     if drive.sensors and all(_misfit(each, options) for each in drive.sensors):
-        return [Reason(Level.FAIL, f"{WRONG_MAP} The calibration was not tested.")]
+        return failure(f"{WRONG_MAP} The calibration was not tested.")
     return [
         *(Reason(Level.WARN, each) for each in drive.doubts),
         *source_reasons(drive.sources),
@@ -104,12 +103,11 @@ def _exchanged(sensor: ValidatedSensor) -> list[Reason]:
     """Return that a sensor reads what another should."""
     if not sensor.reads_as:
         return []
-    text = (
+    return failure(
         f"Its readings fit the calibration of {sensor.reads_as}, not its own: sensors are "
         "exchanged. Exchange their topics, their cables or their names in `bag.fields`. It was "
         f"tested as {sensor.reads_as}."
     )
-    return [Reason(Level.FAIL, text)]
 
 
 def _jumped(drive: DriveValidation, sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
@@ -216,7 +214,7 @@ def _blind(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     hidden = _hidden(sensor, options, "it shows")
     if not hidden:
         return []
-    return [Reason(Level.WARN, f"This drive cannot rule out a change that would FAIL: {hidden}.")]
+    return warning(f"This drive cannot rule out a change that would FAIL: {hidden}.")
 
 
 def _hidden(sensor: ValidatedSensor | ComparedSensor, options: QaOptions, shows: str) -> str:
@@ -234,18 +232,18 @@ def _hidden(sensor: ValidatedSensor | ComparedSensor, options: QaOptions, shows:
 def _ending(sensor: ValidatedSensor, _: QaOptions) -> list[Reason]:
     if not sensor.ending:
         return []
-    return [Reason(Level.WARN, f"Of its calibration: {sensor.ending.rstrip('.')}.")]
+    return warning(f"Of its calibration: {sensor.ending.rstrip('.')}.")
 
 
 def _on_comparison(sensor: ComparedSensor, options: QaOptions) -> list[Reason]:
     """Return what has changed since the older calibration, and what might have unseen."""
     whole = sensor.test("all")
     if not whole.freedom:
-        return [Reason(Level.WARN, "The two calibrations determine nothing of it in common.")]
+        return warning("The two calibrations determine nothing of it in common.")
     reasons = _since(sensor, options)
     if hidden := _hidden(sensor, options, "they show"):
         text = f"The two calibrations cannot rule out a change that would FAIL: {hidden}."
-        reasons.append(Reason(Level.WARN, text))
+        reasons += warning(text)
     return reasons
 
 
@@ -261,9 +259,8 @@ def _since(sensor: ComparedSensor, options: QaOptions) -> list[Reason]:
         ]
     if whole.chance < options.validation.chance / (len(NAMES)):
         times = (whole.chi_square / whole.freedom) ** 0.5
-        text = (
+        return warning(
             f"The two calibrations differ {times:.1f} times as much as their uncertainties allow, "
             "in no single part of it beyond chance: several parts have changed a little together."
         )
-        return [Reason(Level.WARN, text)]
-    return [Reason(Level.PASS, "No change since the old calibration beyond both uncertainties.")]
+    return note("No change since the old calibration beyond both uncertainties.")

@@ -1,6 +1,6 @@
 """What came of the ablation study: errors of each combination, and paired differences."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -181,17 +181,16 @@ def joined(cells: Sequence[AblationCell]) -> BatchErrors:
 
 def combination(place: MapKey, solver: Solver, errors: BatchErrors) -> Combination:
     """Return the errors of one method on one map."""
-    of = by(solver)
-    failed = int(np.count_nonzero(~np.isfinite(of(errors.t))))
-    far = int(np.count_nonzero((of(errors.t) > FAR_M) | (of(errors.H) > FAR_UT)))
-    spreads = (spread(of(errors.t)), spread(of(errors.C)), spread(of(errors.H)))
-    return Combination(*place, solver, len(errors.t), failed, far, *spreads)
+    t, C, H = (of(errors, name, solver) for name in "tCH")
+    failed = int(np.count_nonzero(~np.isfinite(t)))
+    far = int(np.count_nonzero((t > FAR_M) | (H > FAR_UT)))
+    return Combination(*place, solver, len(t), failed, far, spread(t), spread(C), spread(H))
 
 
-def by(solver: Solver) -> Callable[[FloatArray], FloatArray]:
-    """Return what takes a method's column, shape (R,), of errors, shape (R, M)."""
-    column = list(Solver).index(solver)
-    return lambda errors: errors[:, column]
+def of(errors: BatchErrors, name: str, solver: Solver) -> FloatArray:
+    """Return the errors of t, C or H by one method, shape (R,)."""
+    column: FloatArray = getattr(errors, name)[:, list(Solver).index(solver)]
+    return column
 
 
 def spread(errors: FloatArray) -> ErrorQuantiles | None:
@@ -209,7 +208,7 @@ def compared(
     """Return what one combination gains over another."""
     before, after = errors[place], errors[other]
     changed = other[0] if to is solver else to.value
-    gains = (gain(by(solver)(getattr(before, n)), by(to)(getattr(after, n))) for n in "tH")
+    gains = (gain(of(before, name, solver), of(after, name, to)) for name in "tH")
     return Comparison(*place, solver, changed, *gains)
 
 

@@ -9,16 +9,14 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
-from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.data import FloatArray, KnownSensor, joined_rows
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.simulate.hall_drives import calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import (
     HALF_AREA,
     Boxes,
-    CloudVariant,
     SteelHall,
     SteelStructure,
-    hall_cloud,
     steel_hall,
 )
 from l2m_gtsam.simulate.world import SteelWorld, brought_steel
@@ -104,7 +102,7 @@ def loaded_hall(options: ChangesStudyOptions, number: int) -> LoadedHall:
     stood = Loads(inside.positions[standing], inside.moments[standing]).steel(options)
     hall = replace(bare, world=joined(bare.world, stood))
     read = survey(hall, seed, options.heights, options.noise, options.survey_readings)
-    seen = hall_cloud(bare, CloudVariant.ACCURATE, seed), floor_cloud(bare)
+    seen = bare.cloud(), floor_cloud(bare)
     cloud = np.concatenate([*seen, *(surface(options, at) for at in inside.positions[standing])])
     learnt = build_map(read.points, read.field, options.map, cloud)
     span = min(options.heights), max(options.heights)
@@ -147,7 +145,7 @@ def surface(options: ChangesStudyOptions, position: FloatArray) -> FloatArray:
     """Return what a LiDAR sees of a load, metres, shape (P, 3)."""
     edges = np.array(options.edges)
     box = Boxes(("load",), edges[None], position[None], np.zeros(1), np.zeros(1))
-    return SteelStructure(box, position[:2], edges[:2] / 2).cloud(np.zeros(3))
+    return SteelStructure(box, position[:2], edges[:2] / 2).cloud()
 
 
 def drawn(options: ChangesStudyOptions, count: int, rng: np.random.Generator) -> FloatArray:
@@ -168,11 +166,5 @@ def outside(options: ChangesStudyOptions, rng: np.random.Generator) -> FloatArra
 
 def joined(world: SteelWorld, other: SteelWorld) -> SteelWorld:
     """Return a world with the bodies of another, in the field of the first."""
-    return SteelWorld(
-        world.kinds + other.kinds,
-        np.concatenate([world.dimensions, other.dimensions]),
-        np.concatenate([world.centres, other.centres]),
-        np.concatenate([world.R_map_body, other.R_map_body]),
-        np.concatenate([world.polarisations, other.polarisations]),
-        world.earth,
-    )
+    whole = joined_rows([world, other])
+    return replace(whole, kinds=world.kinds + other.kinds, earth=world.earth)

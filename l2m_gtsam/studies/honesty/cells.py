@@ -20,7 +20,7 @@ from l2m_gtsam.studies.honesty.drives import (
 )
 from l2m_gtsam.studies.json_arrays import JsonFloats
 from l2m_gtsam.studies.methods import bound_at
-from l2m_gtsam.validation.innovation import estimate_of
+from l2m_gtsam.validation.innovation import KnownCalibration, estimate_of
 
 PARAMETERS = 16
 OFFSET = slice(15, 16)
@@ -57,10 +57,6 @@ class Outcomes(RowTable):
         """Return the rows of those of which t, C and H have a result and a finite variance."""
         finite = np.isfinite(self.covariance[:, :15, :15]).all(axis=(1, 2))
         return np.flatnonzero(finite & np.isfinite(self.error).all(axis=1))
-
-    def determined(self) -> "Outcomes":
-        """Return those of which t, C and H have a result and a finite variance."""
-        return self[self.determined_rows()]
 
     @property
     def blocks(self) -> dict[str, slice]:
@@ -162,6 +158,5 @@ def bound_of(hall: MappedHall, disturbed: Disturbed, options: OneKeyOptions) -> 
     readings = drive.readings.select(disturbed.change == 0)
     if readings.motion is not None:
         readings = with_offsets(readings, drive.trajectory, drive.offset)
-    vectors = drive.truth()
-    truth = estimate_of(vectors, np.full(len(vectors), hall.noise))
-    return bound_at(readings, hall.field_map, truth, options)
+    known = [KnownCalibration(each, hall.noise, np.zeros((0, 3))) for each in drive.truth()]
+    return bound_at(readings, hall.field_map, estimate_of(known), options)

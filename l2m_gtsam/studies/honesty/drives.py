@@ -16,7 +16,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions, pose_roots
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.simulate.hall_drives import STEP_NS, CalibrationDrive, calibration_drive, survey
-from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
+from l2m_gtsam.simulate.steel_hall import SteelHall, steel_hall
 
 START = 6  # a stream of randomness
 DRIVES_OF_A_HALL = 1000  # at most; no two drives of a study are alike
@@ -104,10 +104,8 @@ def mapped_hall(options: HonestyOptions, noise: float, number: int) -> MappedHal
     seed = options.seed + number
     hall = steel_hall(seed)
     read = survey(hall, seed, options.heights, noise, options.survey_readings)
-    cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
-    learnt = build_map(read.points, read.field, options.map, cloud)
-    compiled = for_solvers(learnt)
-    return MappedHall(hall, seed, noise, compiled)
+    learnt = build_map(read.points, read.field, options.map, hall.cloud())
+    return MappedHall(hall, seed, noise, for_solvers(learnt))
 
 
 def drive_through(

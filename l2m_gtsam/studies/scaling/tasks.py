@@ -12,17 +12,12 @@ from l2m_gtsam.calibration.view import QueryableMap, spread
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.training import ThinningOptions, TrainingSet
-from l2m_gtsam.progress import silent
-from l2m_gtsam.recording.sync import synchronise
 from l2m_gtsam.records.calibration import Uncertainty
-from l2m_gtsam.simulate.drive import drive
-from l2m_gtsam.simulate.recorder import Vehicle, record
-from l2m_gtsam.simulate.route import calibration_route
 from l2m_gtsam.simulate.sensors import random_array
 from l2m_gtsam.studies.measured import MeasuredWork, measured
 from l2m_gtsam.studies.methods import numeric_least_squares
 from l2m_gtsam.studies.scaling.measurements import Measurement, Quantity, ScalingOptions, TimedTask
-from l2m_gtsam.studies.site import SurveyedSite, around
+from l2m_gtsam.studies.site import SurveyedSite, around, readings_of
 
 KINDS = {
     TimedTask.HARMONIC: "harmonic",
@@ -72,13 +67,10 @@ def mapped_drive(
     """
     scenario = options.site.scenario
     known = random_array(scenario.array, np.random.default_rng([options.seed, SENSORS]))[:sensors]
-    rng = np.random.default_rng([options.seed, ROUTE])
-    route = calibration_route(scenario.calibration_route, site.plan)
-    motion = drive(scenario.calibration_drive, route, 0, rng)
     sampling = scenario.calibration_sampling.model_copy(update={"field_rate": rate})
-    vehicle = Vehicle("calibration", known, motion, sampling, scenario.noise)
-    simulated = record(vehicle, site.world, rng, silent)
-    readings = synchronise(simulated.recording, options.site.sync).readings
+    sampled = scenario.model_copy(update={"calibration_sampling": sampling})
+    chosen = options.site.model_copy(update={"scenario": sampled})
+    readings = readings_of(site, chosen, known, np.random.default_rng([options.seed, ROUTE]))
     part = around(site, readings.p_map_lidar, options.around)
     t_true = np.array([sensor.t_lidar_mag for sensor in known])
     return MappedDrive(part.map(options.site.mapping.model), readings, t_true)

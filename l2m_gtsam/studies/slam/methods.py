@@ -6,13 +6,13 @@ from enum import StrEnum
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, Recording, SyncCounts, Trajectory
 from l2m_gtsam.geometry import polar_rotation
 from l2m_gtsam.options import Options
 from l2m_gtsam.progress import silent
+from l2m_gtsam.qa.metrics.trajectory import compared
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     SensorCalibration,
@@ -115,9 +115,8 @@ def online_row(
 ) -> MethodRow:
     """Return those of ``l2m slam --online`` without a map: each pose when it is made."""
     recording, sensor = drive.recording(odometry), as_recorded(noise_ut)
-    return MethodRow.of(
-        measured(lambda: followed(recording, OnlineSlam(sensor, options))), drive.truth
-    )
+    took = measured(lambda: followed(recording, OnlineSlam(sensor, options)))
+    return MethodRow.of(took, drive.truth)
 
 
 def followed(recording: Recording, slam: OnlineSlam) -> Trajectory:
@@ -204,9 +203,7 @@ def squared_errors(estimate: Trajectory, truth: Trajectory) -> FloatArray | None
     """
     if estimate.covariance is None:
         return None
-    turn = Rotation.from_matrix(estimate.R.transpose(0, 2, 1) @ truth.R).as_rotvec()
-    shift = np.einsum("nji,nj->ni", estimate.R, truth.p - estimate.p)
-    return nees(np.hstack([turn, shift])[1:], estimate.covariance[1:])
+    return nees(compared(truth, estimate).right[1:], estimate.covariance[1:])
 
 
 RECORDINGS = ("ship-1", "ship-2", "hand-0", "hand-1")

@@ -36,11 +36,7 @@ def _slipped(
     slip = share * length * np.array([np.cos(heading), np.sin(heading), 1.0])
     turn = Rotation.from_matrix(turns).as_rotvec()
     turn = turn + TURN_RAD * np.sqrt(length) * about * rng.normal(size=turn.shape)
-    R, p = [truth.R[0]], [truth.p[0]]
-    for own, step, off in zip(Rotation.from_rotvec(turn).as_matrix(), steps, slip, strict=True):
-        p.append(p[-1] + R[-1] @ step + off)
-        R.append(R[-1] @ own)
-    return replace(truth, R=np.stack(R), p=np.stack(p))
+    return _chained(truth, Rotation.from_rotvec(turn).as_matrix(), steps, slip)
 
 
 def walked(truth: Trajectory, rng: np.random.Generator) -> Trajectory:
@@ -53,9 +49,16 @@ def walked(truth: Trajectory, rng: np.random.Generator) -> Trajectory:
     off = level * np.einsum("nij,nj->ni", root, rng.normal(size=(len(steps), 6)))
     steps = steps + np.einsum("nij,nj->ni", turns, off[:, 3:])
     turns = turns @ Rotation.from_rotvec(off[:, :3]).as_matrix()
+    return _chained(truth, turns, steps, np.zeros_like(steps))
+
+
+def _chained(
+    truth: Trajectory, turns: FloatArray, steps: FloatArray, slips: FloatArray
+) -> Trajectory:
+    """Return poses, each a turn, a step along the axes of the one before and a slip further."""
     R, p = [truth.R[0]], [truth.p[0]]
-    for turn, step in zip(turns, steps, strict=True):
-        p.append(p[-1] + R[-1] @ step)
+    for turn, step, slip in zip(turns, steps, slips, strict=True):
+        p.append(p[-1] + R[-1] @ step + slip)
         R.append(R[-1] @ turn)
     return replace(truth, R=np.stack(R), p=np.stack(p))
 

@@ -8,6 +8,7 @@ methods run from fewer starts on the first few drives of each path.
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import NoiseOptions, SamplingOptions, SensorArrayOptions
 from l2m_gtsam.studies.json_arrays import JsonFloats
 from l2m_gtsam.studies.methods import cramer_rao
-from l2m_gtsam.studies.naive_peer import NaiveMap, NaiveOptions, naive_map
+from l2m_gtsam.studies.naive_peer import NaiveMap, NaiveOptions, naive_map, naive_peer
 from l2m_gtsam.studies.site import SiteDrive, SiteOptions, SurveyedSite, random_drive, surveyed
 from l2m_gtsam.studies.table1.methods import (
     HARMONIC,
@@ -39,7 +40,6 @@ from l2m_gtsam.studies.table1.methods import (
     MethodResult,
     from_each,
     magyc,
-    naive,
     one_key,
 )
 
@@ -195,10 +195,9 @@ def compute(
     if number < options.others:
         few = t_start[: options.other_starts]
         ends += other_ends(drive, place, few, options)
-        peer = naive(
-            drive.readings, place.naive_map(path, drive, options.naive), few, options.naive
-        )
-        ends.append(ends_of(NAIVE, THINNED, drive, peer))
+        peer_map = place.naive_map(path, drive, options.naive)
+        solve = partial(naive_peer, drive.readings, peer_map, options.naive)
+        ends.append(ends_of(NAIVE, THINNED, drive, from_each(solve, few)))
     if number < options.magyc:
         peer = magyc(drive.readings, drive.sensor.distortion.C)
         ends.append(ends_of(MAGYC, NO_MAP, drive, peer))
@@ -213,7 +212,7 @@ def other_ends(
 ) -> list[Ends]:
     """Return where the paper's methods end on both maps, and ours on the paper's."""
     ends = [
-        ends_of(name, kind, drive, from_each(solve, drive.readings, field_map, t_start))
+        ends_of(name, kind, drive, from_each(partial(solve, drive.readings, field_map), t_start))
         for kind, field_map in place.maps.items()
         for name, solve in OTHERS.items()
     ]

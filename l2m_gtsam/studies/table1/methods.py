@@ -14,7 +14,6 @@ from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
 from l2m_gtsam.studies.magyc_peer import ChipDrive, magyc_peer, magyc_python
 from l2m_gtsam.studies.methods import as_published, one_key_from, two_step
-from l2m_gtsam.studies.naive_peer import NaiveMap, NaiveOptions, naive_peer
 
 OURS, NAIVE, MAGYC = "one-key", "naive peer", "magyc"
 HARMONIC, SLIDING, THINNED, NO_MAP = "harmonic", "sliding_gp", "thinned GP", "none"
@@ -60,23 +59,11 @@ OTHERS: dict[str, Solver] = {
 }
 
 
-def from_each(
-    solve: Solver, readings: Readings, field_map: QueryableMap, t_start: FloatArray
-) -> MethodResult:
+def from_each(solve: Callable[[FloatArray], FloatArray], t_start: FloatArray) -> MethodResult:
     """Return where a method ends from each start, shape (N, 3)."""
     begin = process_time()
-    ends = np.array([solve(readings, field_map, t) for t in t_start])
+    ends = np.array([solve(t) for t in t_start])
     return MethodResult(ends, len(t_start), (process_time() - begin) / len(t_start))
-
-
-def naive(
-    readings: Readings, field_map: NaiveMap, t_start: FloatArray, options: NaiveOptions
-) -> MethodResult:
-    """Return where the naive peer ends from each start, shape (N, 3)."""
-    begin = process_time()
-    ends = [naive_peer(readings, field_map, t, options) for t in t_start]
-    vector = np.array([np.concatenate([end.t, end.C.ravel(), end.H]) for end in ends])
-    return MethodResult(vector, len(ends), (process_time() - begin) / len(ends))
 
 
 def magyc(readings: Readings, C: FloatArray) -> MethodResult:
@@ -90,9 +77,8 @@ def magyc(readings: Readings, C: FloatArray) -> MethodResult:
         It has no environment, or fails.
     """
     R_mag_lidar = np.asarray(polar(C)[0])
-    (estimate,) = magyc_peer([ChipDrive(readings, R_mag_lidar)], magyc_python())
-    vector = np.concatenate([estimate.t, estimate.C.ravel(), estimate.H])
-    return MethodResult(vector[None], 1, estimate.seconds)
+    (found,) = magyc_peer([ChipDrive(readings, R_mag_lidar)], magyc_python())
+    return MethodResult(np.append(np.full(12, np.nan), found.H)[None], 1, found.seconds)
 
 
 def one_key(

@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import (
     BoolArray,
-    FieldSeries,
     FloatArray,
     KnownSensor,
     Readings,
@@ -59,18 +58,10 @@ def troubled_drive(
         trajectory = bent(trajectory, options, rng)
     if trouble.has(Trouble.POSES) or trouble is Trouble.POSES_STATED:
         trajectory = misplaced(trajectory, options, rng)
-    series = tuple(
-        FieldSeries(
-            sensor.sensor,
-            f"/{sensor.sensor}",
-            sensor.sensor,
-            readings.stamp_ns[readings.rows_of(index)],
-            (readings.field + change)[readings.rows_of(index)],
-        )
-        for index, sensor in enumerate(drive.sensors)
-    )
+    readings = replace(readings, field=readings.field + change)
+    recorded = replace(drive, readings=readings, trajectory=trajectory)
     source = SourceFile(f"place-{place.truth.seed}-drive-{number}", "")
-    return Recording(trajectory, series, source), tuple(truth)
+    return recorded.recording(source), tuple(truth)
 
 
 def smoothed(drive: CalibrationDrive, place: Place, constant_s: float) -> CalibrationDrive:

@@ -27,7 +27,7 @@ from l2m_gtsam.simulate.hall_drives import (
 )
 from l2m_gtsam.simulate.office_corridor import OfficeCorridor, office_corridor
 from l2m_gtsam.simulate.office_drives import office_drive, survey_way
-from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
+from l2m_gtsam.simulate.steel_hall import SteelHall, steel_hall
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 
 SENSORS = 2
@@ -50,7 +50,7 @@ class Hall:
 
     def cloud(self) -> FloatArray:
         """Return what a LiDAR saw of posts and racks, shape (M, 3), metres."""
-        return hall_cloud(self.hall, CloudVariant.ACCURATE, self.seed)
+        return self.hall.cloud()
 
     def survey_way(self, options: TroublesOptions) -> FloatArray:
         """Return lanes over the floor."""
@@ -126,8 +126,7 @@ def troubled_place(
         suite = {name: replace(each, covariance=None) for name, each in suite.items()}
     chosen = MappingOptions(model=options.map)
     learnt = map_recordings([recording], suite, chosen, truth.cloud())
-    compiled = for_solvers(learnt)
-    return TroubledPlace(truth, compiled)
+    return TroubledPlace(truth, for_solvers(learnt))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +13,6 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import (
     Distortion,
-    FieldSeries,
     FloatArray,
     KnownSensor,
     Recording,
@@ -22,8 +22,8 @@ from l2m_gtsam.data import (
 from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, calibration_drive, survey
-from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
+from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, CalibrationDrive, calibration_drive, survey
+from l2m_gtsam.simulate.steel_hall import SteelHall, steel_hall
 from l2m_gtsam.simulate.world import SteelWorld, brought_steel, place_beside
 from l2m_gtsam.studies.honesty.drives import drive_seed
 
@@ -118,8 +118,7 @@ def calibrated_hall(options: ValidationStudyOptions, number: int) -> CalibratedH
     seed = options.seed + number
     hall = steel_hall(seed)
     read = survey(hall, seed, options.heights, options.noise, options.survey_readings)
-    cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
-    learnt = build_map(read.points, read.field, options.map, cloud)
+    learnt = build_map(read.points, read.field, options.map, hall.cloud())
     field_map = for_solvers(learnt)
     span = min(options.heights), max(options.heights)
     sensors = calibration_drive(hall, seed, span, options.noise, options.sensors, 30).sensors
@@ -172,18 +171,16 @@ def recorded(
     steel: SteelWorld,
 ) -> Recording:
     """Return what sensors read on a path through a hall and the steel that was brought to it."""
-    poses, series = path.trajectory, []
-    rng = np.random.default_rng([path.seed, 21])
-    for sensor in sensors:
-        x = poses.R @ sensor.t_lidar_mag + poses.p
-        free = np.flatnonzero(hall.free(x, CLEARANCE_M))
-        rows = free[np.linspace(0, len(free) - 1, options.readings).round().astype(np.int64)]
-        B = hall.world.field(x[rows]) + steel.field(x[rows])
-        b_lidar = np.einsum("nji,nj->ni", poses.R[rows], B)
-        field = sensor.distortion.apply(b_lidar) + options.noise * rng.standard_normal(B.shape)
-        name = sensor.sensor
-        series.append(FieldSeries(name, f"/{name}", name, poses.stamp_ns[rows], field))
-    return Recording(poses, tuple(series), SourceFile(f"drive-{path.seed}", str(path.seed)))
+    drive = CalibrationDrive.along(
+        path.trajectory,
+        sensors,
+        partial(hall.free, clearance=CLEARANCE_M),
+        lambda x: hall.world.field(x) + steel.field(x),
+        options.noise,
+        options.readings,
+        np.random.default_rng([path.seed, 21]),
+    )
+    return drive.recording(SourceFile(f"drive-{path.seed}", str(path.seed)))
 
 
 def changed_drive(

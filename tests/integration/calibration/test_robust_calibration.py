@@ -15,7 +15,7 @@ from l2m_gtsam.maps.harmonic.learning import LearningOptions
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
-from l2m_gtsam.simulate.steel_hall import CloudVariant, hall_cloud, steel_hall
+from l2m_gtsam.simulate.steel_hall import steel_hall
 from l2m_gtsam.solve.robust import Loss, RobustOptions
 from l2m_gtsam.studies.honesty.drives import Disturbed, spikes
 from tests.drives.disturbances import bursts, moved_steel
@@ -41,9 +41,9 @@ def place(
 ) -> Place:
     hall = steel_hall(seed)
     data = survey(hall, seed, noise=NOISE)
-    cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
+    cloud = hall.cloud()
     field_map = HarmonicMap.fit(data.points, data.field, options, cloud=cloud)
-    drive = calibration_drive(hall, seed, data.span, NOISE, sensors=sensors, count=count)
+    drive = calibration_drive(hall, seed, (0.4, 1.0), NOISE, sensors=sensors, count=count)
     return Place(field_map.compile(), drive)
 
 

@@ -21,7 +21,7 @@ from l2m_gtsam.maps.harmonic.tiles import Tile
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
 from l2m_gtsam.simulate.hall_drives import survey
-from l2m_gtsam.simulate.steel_hall import STRONG, CloudVariant, hall_cloud, steel_hall
+from l2m_gtsam.simulate.steel_hall import STRONG, steel_hall
 from tests.worlds.exact import dipole_world
 
 OVER = np.array([0.0, 0.0, 4.0])  # metres: from the drive to where no reading is near
@@ -58,7 +58,7 @@ def hall() -> HarmonicMap:
     """Return the map of a hall with strong posts that a LiDAR saw."""
     world = steel_hall(3, STRONG, posts=3, racks=0)
     data = survey(world, 3, count=600)
-    cloud = hall_cloud(world, CloudVariant.ACCURATE, 3)
+    cloud = world.cloud()
     return HarmonicMap.fit(data.points, data.field, OPTIONS, cloud)
 
 

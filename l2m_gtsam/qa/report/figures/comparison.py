@@ -37,38 +37,26 @@ def drives_figure(sensor: SensorCalibration, found: Repeatability) -> Figure:
     parts = figure.subplots(2, 3, sharex=True, sharey="row")
     whole = sensor.vector()
     sigma = np.sqrt(np.diag(sensor.covariance))
-    for axes_of, first, factor, name, unit in zip(
-        parts, (0, 12), (1e3, 1.0), ("t", "H"), ("mm", "µT"), strict=True
-    ):
-        for k, axes in enumerate(axes_of):
-            at = first + k
-            values = [(each.estimate[at] - whole[at], each.sigma[at]) for each in found.drives]
-            _draw(axes, factor * np.array(values), factor * float(sigma[at]))
-            axes.set_title(f"{name}{'xyz'[k]}")
-        axes_of[0].set_ylabel(f"off by ({unit})")
-    step = max(1, -(-len(found.drives) // MANY))
-    numbers = range(0, len(found.drives), step)
+    count = len(found.drives)
+    numbers = range(0, count, max(1, -(-count // MANY)))
     for axes in parts[-1]:
         axes.set_xticks(numbers, [str(k + 1) for k in numbers], fontsize=SMALL)
-        axes.set_xlim(-0.6, len(found.drives) - 0.4)
-    for axes, at, factor, unit in zip(
-        parts.ravel(),
-        (0, 1, 2, 12, 13, 14),
-        3 * (1e3,) + 3 * (1.0,),
-        3 * ("mm",) + 3 * ("µT",),
-        strict=True,
-    ):
-        words = [
-            f"drive {k + 1}, {each.bag}: "
-            + with_sigma(
-                factor * (each.estimate[at] - whole[at]),
-                factor * each.sigma[at],
-                unit,
-                signed=True,
-            )
-            for k, each in enumerate(found.drives)
+        axes.set_xlim(-0.6, count - 0.4)
+    for axes, at in zip(parts.ravel(), (0, 1, 2, 12, 13, 14), strict=True):
+        name, unit, factor = ("t", "mm", 1e3) if at < 3 else ("H", "µT", 1.0)
+        values = [
+            (factor * (each.estimate[at] - whole[at]), factor * each.sigma[at])
+            for each in found.drives
         ]
-        axes_strips(axes, np.arange(float(len(found.drives))), words)
+        _draw(axes, np.array(values), factor * float(sigma[at]))
+        axes.set_title(f"{name}{'xyz'[at % 3]}")
+        if at % 3 == 0:
+            axes.set_ylabel(f"off by ({unit})")
+        words = [
+            f"drive {k}, {each.bag}: {with_sigma(*own, unit, signed=True)}"
+            for k, (each, own) in enumerate(zip(found.drives, values, strict=True), start=1)
+        ]
+        axes_strips(axes, np.arange(float(count)), words)
     parts[-1][1].set_xlabel("drive")
     return figure
 

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
@@ -30,7 +29,7 @@ from l2m_gtsam.qa.report.drawing import (
     shades,
     spread,
 )
-from l2m_gtsam.qa.report.figures.map_changes import draw_changes, list_changes
+from l2m_gtsam.qa.report.figures.map_changes import draw_changes, draw_extent, list_changes
 from l2m_gtsam.qa.report.hover import axes_image, places, some_and_marked
 from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
 from l2m_gtsam.records.calibration import Disagreement
@@ -66,10 +65,7 @@ def strength_figure(
 def draw_source(axes: Axes, source: ChangedSource, name: str) -> None:
     """Draw where a source is, how long it is, and how well its place is known."""
     x, y = source.position[:2]
-    ends = np.array([source.position - source.half_axis, source.position + source.half_axis])
-    axes.plot(*ends[:, :2].T, color=BAD, linewidth=4, solid_capstyle="round")
-    radius = 2 * float(np.max(source.position_sigma[:2]))
-    axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=BAD, linewidth=1.2))
+    draw_extent(axes, source, BAD, 1.2)
     axes.plot(x, y, "o", color=BAD, markersize=15, markeredgecolor=PAPER)
     style: Any = {"ha": "center", "va": "center", "fontsize": SMALL, "fontweight": "bold"}
     axes.annotate(name, (x, y), color="white", **style)
@@ -235,11 +231,10 @@ def map_figure(field_map: FieldMap, height: float | None) -> Figure:
     level = float(lower[2] + upper[2]) / 2 if height is None else height
     cut = slice_map(field_map, lower[:2], upper[:2], level, CELLS)
     if not np.isfinite(cut.strength).any():
-        msg = (
+        raise MapError(
             f"the map has no data at z = {level:g} m, its readings run from {lower[2]:.2f} to "
             f"{upper[2]:.2f} m"
         )
-        raise MapError(msg)
     diary = field_map.diary if isinstance(field_map, Remembering) else None
     wide_enough = 12 if diary is None else 17
     figure = Figure(figsize=(wide_enough, 5), layout="constrained", dpi=130)

@@ -16,6 +16,7 @@ from l2m_gtsam.records.map_diary import (
     doubtful,
     words_of,
 )
+from l2m_gtsam.records.places import ChangedSource
 
 # Of steel that came, and of steel that is no longer there: seen on the map's colours by all.
 HERE, GONE = "#d55e00", "#56b4e9"
@@ -61,10 +62,7 @@ def draw_change(axes: Axes, change: DatedChange, name: str) -> None:
     """Draw a source: filled where it came, empty where it went, with two sigmas around it."""
     source, colour = change.source, GONE if change.went else HERE
     x, y = source.position[:2]
-    ends = np.array([source.position - source.half_axis, source.position + source.half_axis])
-    axes.plot(*ends[:, :2].T, color=colour, linewidth=4, solid_capstyle="round")
-    radius = 2 * float(np.max(source.position_sigma[:2]))
-    axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=colour, linewidth=1.0))
+    draw_extent(axes, source, colour, 1.0)
     half = change.what is Happening.EITHER
     face: Any = {"fillstyle": "bottom" if half else "none" if change.went else "full"}
     face |= {"markerfacecolor": colour, "markerfacecoloralt": "white"}
@@ -72,6 +70,15 @@ def draw_change(axes: Axes, change: DatedChange, name: str) -> None:
     style: Any = {"xytext": (8, 6), "textcoords": "offset points", "fontsize": SMALL + 1}
     box: Any = {"facecolor": "white", "edgecolor": colour, "alpha": 0.9, "pad": 1.5}
     axes.annotate(name, (x, y), color="black", bbox=box, **style)
+
+
+def draw_extent(axes: Axes, source: ChangedSource, colour: str, width: float) -> None:
+    """Draw how long a source is, and two sigmas of its place as a line of so many points."""
+    ends = np.array([source.position - source.half_axis, source.position + source.half_axis])
+    axes.plot(*ends[:, :2].T, color=colour, linewidth=4, solid_capstyle="round")
+    x, y = source.position[:2]
+    radius = 2 * float(np.max(source.position_sigma[:2]))
+    axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=colour, linewidth=width))
 
 
 def list_changes(axes: Axes, diary: MapDiary) -> None:

@@ -1,6 +1,7 @@
 """What a sensor read along the drive, and from which directions the field came."""
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.qa.report.drawing import (
@@ -17,6 +18,7 @@ from l2m_gtsam.qa.report.drawing import (
     spread,
     stacked,
 )
+from l2m_gtsam.qa.report.figures.map import residual_figure
 from l2m_gtsam.qa.report.hover import places, some, some_and_marked, strips
 from l2m_gtsam.qa.report.svg import AXES, BAD, GRID, INK, MUTED, SMALL, X, Y
 from l2m_gtsam.records.metrics import SensorMetrics, Series
@@ -31,6 +33,15 @@ SIZE = 164.0  # points of a disk with its room
 ENDS = (-1.15, 1.15)
 AXIS = letters("start", colour=MUTED)
 AFTER = Stroke(Y, 1.0, dashes=(3.7, 1.6))
+
+
+def series_figures(series: Series) -> dict[str, Figure | Drawing]:
+    """Return all that is drawn of a sensor's readings, by the keys of pages."""
+    return {
+        "curves": curves_figure(series),
+        "residuals": residuals_figure(series),
+        "place": residual_figure(series),
+    }
 
 
 def residuals_figure(series: Series) -> Drawing:

@@ -1,0 +1,74 @@
+"""A hall of dipoles that several benchmarks drive through: its survey, its map and its sensors."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, Readings
+from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
+from tests.worlds.exact import DipoleWorld
+
+NOISE = 0.1  # uT, of the survey and of the sensors
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Readings of a map survey, positions in metres and fields in uT, shape (N, 3)."""
+
+    points: FloatArray
+    field: FloatArray
+
+
+def hall(seed: int) -> DipoleWorld:
+    """Return a hall with steel 1.5 m under its floor and 3 m above it: a few uT, well mapped."""
+    rng = np.random.default_rng(seed)
+    positions = rng.uniform([-8, -8, 0], [8, 8, 0], (60, 3))
+    positions[:, 2] = np.where(np.arange(60) % 2 == 0, -1.5, 3.0)
+    return DipoleWorld(np.array([22.0, 3.0, -38.0]), positions, rng.normal(0, 120, (60, 3)))
+
+
+def survey(world: DipoleWorld, count: int) -> Survey:
+    """Return readings in the volume that the drives of the benchmark pass."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-5.5, -5.5, -0.6], [5.5, 5.5, 1.6], (count, 3))
+    field, _ = world.field_and_gradient(points)
+    return Survey(points, field + rng.normal(0, NOISE, field.shape))
+
+
+def compiled_map(world: DipoleWorld) -> CompiledMap:
+    """Return the harmonic map of a survey, compiled."""
+    data = survey(world, 8000)
+    return HarmonicMap.fit(data.points, data.field).compile()
+
+
+def read_together(
+    sensors: tuple[KnownSensor, ...],
+    world: DipoleWorld,
+    R: FloatArray,
+    p: FloatArray,
+    stamp_ns: IntArray,
+    seed: int,
+) -> Readings:
+    """Return what sensors read at the same poses, (N, 3, 3) and (N, 3), with noise."""
+    rng, fields, count = np.random.default_rng(seed), [], len(sensors)
+    for known in sensors:
+        B, _ = world.field_and_gradient(R @ known.t_lidar_mag + p)
+        b = np.einsum("nji,nj->ni", R, B)
+        fields.append(known.distortion.apply(b) + rng.normal(0, NOISE, b.shape))
+    return Readings(
+        tuple(known.sensor for known in sensors),
+        np.repeat(np.arange(count), len(p)),
+        np.tile(stamp_ns, count),
+        np.tile(R, (count, 1, 1)),
+        np.tile(p, (count, 1)),
+        np.concatenate(fields),
+    )
+
+
+def true_start(sensors: tuple[KnownSensor, ...], options: OneKeyOptions) -> Estimate:
+    """Return an estimate that is the truth."""
+    start = start_estimate(np.stack([s.t_lidar_mag for s in sensors]), options)
+    truth = np.stack([s.distortion.vector() for s in sensors])
+    return replace(start, distortion=truth, noise=np.full(len(sensors), NOISE))
