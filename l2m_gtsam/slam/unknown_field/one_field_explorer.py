@@ -16,7 +16,7 @@ odometry excludes is refused, and the drive goes on by odometry until the drive 
 key poses with their readings are kept, about a kilobyte of each.
 """
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -32,7 +32,7 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.field_filter import DeadReckoning, FieldFilter, FilterState
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import Hypotheses, Hypothesis, step_of
 from l2m_gtsam.slam.unknown_field.read_path import ReadPath
-from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, SmoothedDrive, end_state, smoothed
+from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, end_state, smoothed
 from l2m_gtsam.slam.unknown_field.whole_field import (
     COARSE,
     WholePrior,
@@ -108,6 +108,10 @@ class FollowedField:
     hypotheses: Hypotheses
 
 
+Pieces = Iterator[FollowedField | float | None]
+"""Work in pieces: the last yields the field, those before the share that is done or nothing."""
+
+
 class OneFieldExplorer:
     """Estimates poses and one field on line from the readings of one sensor.
 
@@ -129,7 +133,7 @@ class OneFieldExplorer:
         # The same less a drift near that of the estimate.
         self._drifting = DeadReckoning.at_start()
         self._now: FollowedField | None = None
-        self._work: Iterator[FollowedField | None] | None = None
+        self._work: Pieces | None = None
         self._open: list[int] = []  # steps in doubt that are not decided
         self._decisions: dict[int, StepDecision] = {}
         self._news: list[StepDecision] = []
@@ -268,7 +272,7 @@ class OneFieldExplorer:
         ]
         return drive_of(chosen, self.start, self._sensors)
 
-    def _due(self, now: FollowedField | None) -> Iterator[FollowedField | None] | None:
+    def _due(self, now: FollowedField | None) -> Pieces | None:
         """Return work that is due, to be done in pieces."""
         is_long = self._read.length_m >= self._options.whole_field.solve_after_m
         if not (self._read.is_enough and is_long):
@@ -279,7 +283,7 @@ class OneFieldExplorer:
         growth = GROWN if inside else LEFT
         return self._learning(now) if self._path_m >= growth * self._learnt_m else None
 
-    def _learning(self, now: FollowedField | None) -> Iterator[FollowedField | None]:
+    def _learning(self, now: FollowedField | None) -> Pieces:
         """Solve the drive so far, and follow the rest, in pieces."""
         self._learnt_m = self._path_m
         # A step that nothing has decided yet is followed both ways.
@@ -287,7 +291,10 @@ class OneFieldExplorer:
         recorded = frozenset(each for each in self._recorded if each < count)
         drive = self._drive(count)
         solvable = LEAST <= count <= MOST and len(drive.readings) >= FEWEST
-        smooth = (yield from self._smoothing(drive)) if solvable else None
+        smooth = None
+        if solvable:
+            initial = drive.dead_reckoning()
+            smooth = yield from smoothed(drive, initial, self._options, ON_LINE)
         if smooth is not None:
             poses = smooth.stage.last.poses
             relative = tuple(poses[0].between(pose) for pose in poses)
@@ -301,17 +308,6 @@ class OneFieldExplorer:
         yield None
         prior = capped_prior(everything, poses, options, spectrum, COARSE)
         yield from self._following(prior, None)
-
-    def _smoothing(self, drive: Drive) -> Generator[None, None, SmoothedDrive | None]:
-        """Solve a drive in pieces; return None where the field has too much detail for that."""
-        work = smoothed(drive, drive.dead_reckoning(), self._options, ON_LINE)
-        while True:
-            try:
-                next(work)
-            except StopIteration as end:
-                found: SmoothedDrive | None = end.value
-                return found
-            yield None
 
     def _is_possible(self, now: FollowedField) -> bool:
         """Return whether odometry, with the drift that is stated, can have been so far off."""
@@ -330,9 +326,7 @@ class OneFieldExplorer:
         self._learnt_m = self._path_m
         self._has_refused = True
 
-    def _following(
-        self, prior: WholePrior, beginning: SolvedBeginning | None
-    ) -> Iterator[FollowedField | None]:
+    def _following(self, prior: WholePrior, beginning: SolvedBeginning | None) -> Pieces:
         """Follow all key poses from a beginning, or the start, on, in pieces.
 
         Yields nothing, and at last the result.
@@ -364,7 +358,7 @@ class OneFieldExplorer:
     def _go_on(self) -> None:
         """Do a piece of the work, if there is any."""
         found = None if self._work is None else next(self._work)
-        if found is not None:
+        if isinstance(found, FollowedField):
             self._now, self._work = found, None
             self._decide(found.hypotheses)
 
