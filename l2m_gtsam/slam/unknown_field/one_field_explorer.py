@@ -36,7 +36,7 @@ from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, end_state, smoo
 from l2m_gtsam.slam.unknown_field.whole_field import (
     COARSE,
     WholePrior,
-    capped_prior,
+    full_prior,
     spectrum_at,
 )
 from l2m_gtsam.solve.chi_square import exceeded_by
@@ -306,7 +306,7 @@ class OneFieldExplorer:
         first, poses = None if now is None else now.prior.spectrum, self.poses()
         spectrum = spectrum_at(everything, poses, options, COARSE, first)
         yield None
-        prior = capped_prior(everything, poses, options, spectrum, COARSE)
+        prior = full_prior(everything, poses, spectrum, COARSE).capped(options.waves)
         yield from self._following(prior, None)
 
     def _is_possible(self, now: FollowedField) -> bool:

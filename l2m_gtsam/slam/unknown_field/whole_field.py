@@ -14,7 +14,6 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.potential import PotentialBasis
 from l2m_gtsam.slam.drive import Drive, KnownSensors
-from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
 from l2m_gtsam.slam.options import WholeFieldOptions
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
@@ -126,6 +125,10 @@ class WholePrior:
         basis = PotentialBasis.over(self.low, self.high, self.spectrum.prior, self.waves)
         return WholeField(basis)
 
+    def capped(self, most: int) -> "WholePrior":
+        """Return it with so many eigenfunctions at most: what shorter waves hold is noise."""
+        return replace(self, waves=min(self.waves, most))
+
     def divided(
         self, motions: RelativeMotions, poses: list[gtsam.Pose3], sensors: KnownSensors
     ) -> TiledDrive:
@@ -170,9 +173,8 @@ def fine_prior(
     first: FieldSpectrum | None = None,
 ) -> WholePrior:
     """Learn the prior of a fine field, for good poses; parameters as of ``learnt_prior``."""
-    return capped_prior(
-        drive, poses, options, spectrum_at(drive, poses, options, FINE, first), FINE
-    )
+    spectrum = spectrum_at(drive, poses, options, FINE, first)
+    return full_prior(drive, poses, spectrum, FINE).capped(options.waves)
 
 
 def spectrum_at(
@@ -186,7 +188,7 @@ def spectrum_at(
 
     Other parameters as of ``learnt_prior``.
     """
-    where = placed(drive, poses)
+    where = relative_place(drive.readings, poses, 0, drive.sensors)
     x, R = where.x, where.readings.R_map_lidar
     few = np.linspace(0, len(x) - 1, min(len(x), LEARNT_FROM)).round().astype(int)
     corrected = np.einsum("nji,nj->ni", R, where.field(drive.sensors))
@@ -206,32 +208,15 @@ def prior_about(
     return prior if prior.waves <= options.waves else None
 
 
-def capped_prior(
-    drive: Drive,
-    poses: list[gtsam.Pose3],
-    options: WholeFieldOptions,
-    spectrum: FieldSpectrum,
-    detail: FieldDetail,
-) -> WholePrior:
-    """Return the prior of a field with any detail: what shorter waves hold counts as noise."""
-    prior = full_prior(drive, poses, spectrum, detail)
-    return replace(prior, waves=min(prior.waves, options.waves))
-
-
 def full_prior(
     drive: Drive, poses: list[gtsam.Pose3], spectrum: FieldSpectrum, detail: FieldDetail
 ) -> WholePrior:
     """Return the prior in a box about the poses with all waves that the field needs."""
-    x, margin = placed(drive, poses).x, MARGIN * spectrum.prior.length
+    x = relative_place(drive.readings, poses, 0, drive.sensors).x
+    margin = MARGIN * spectrum.prior.length
     low, high = x.min(axis=0) - margin, x.max(axis=0) + margin
     waves = waves_for(high - low, detail.cut / spectrum.prior.length)
     return WholePrior(spectrum, low, high, waves)
-
-
-def placed(drive: Drive, poses: list[gtsam.Pose3]) -> PlacedReadings:
-    """Return a drive's readings in the frame of its first key pose."""
-    relative = [poses[0].between(pose) for pose in poses]
-    return place_readings(drive.readings, relative, drive.sensors)
 
 
 def waves_for(size: FloatArray, cut: float) -> int:

@@ -28,7 +28,7 @@ from l2m_gtsam.slam.unknown_field.smoothed_drive import (
     OFF_LINE,
     SmoothedDrive,
     SolvedStage,
-    followed_with,
+    followed,
     smoothed,
     solved_stage,
     stage_problem,
@@ -180,7 +180,7 @@ class DriveLikelihood:
         prior = prior_about(drive, drive.dead_reckoning(), whole, self._spectrum)
         if prior is None:
             return -np.inf
-        return followed_with(drive, prior, FOLLOWED[0], self._options).log_likelihood
+        return followed(drive, prior, FOLLOWED[0], self._options).log_likelihood
 
     @cached_property
     def _spectrum(self) -> FieldSpectrum | None:
