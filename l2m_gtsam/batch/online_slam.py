@@ -20,10 +20,11 @@ from l2m_gtsam.batch.slam import (
     calibration_notes,
     check_not_replaced,
     map_provenance,
+    opened,
     write_refined,
 )
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import FloatArray, Recording, RigidTransform, Trajectory
+from l2m_gtsam.data import FloatArray, Recording, Trajectory
 from l2m_gtsam.errors import LidarError, SyncError
 from l2m_gtsam.geometry import compose
 from l2m_gtsam.lidar.surface import Surface, library
@@ -135,7 +136,7 @@ def slam_online(
         raise SyncError(f"{given.bag}: odometry of one pose; two or more are needed")
     if truth is not None:
         check_truth(truth, recording.trajectory, config.slam.max_pose_gap_s, str(given.truth))
-    field_map = None if saved is None else _opened(saved, recording, config, progress)
+    field_map = None if saved is None else opened(saved, recording, config, progress)
     matcher, ignored = _matcher_or_why_not(given.bag, saved, config)
     still = without_moving_fields(recording, calibration, config.slam.regressors)
     begun = _begun(still.calibration, config, field_map, matcher, out, resume=resume)
@@ -198,10 +199,6 @@ def _begun(
     after = max((each.stamp_ns for each in slam.intake.state.poses), default=-1)
     lines = tuple(each for each in read_log(out / LOG_FILE) if each.stamp_ns <= slam.stamp_ns)
     return _Begun(slam, lines, after)
-
-
-def _opened(saved: SavedMap, recording: Recording, config: Config, progress: Progress) -> FieldMap:
-    return saved.open(progress, [recording] if config.slam.start.by_odometry else [])
 
 
 def _matcher_or_why_not(
@@ -317,8 +314,7 @@ def _write_map_so_far(
 
 def in_map(odometry: Trajectory, found: Trajectory) -> Trajectory:
     """Return odometry at the same times as found poses, from the first of these on."""
-    first, begin = (RigidTransform(each.R[0], each.p[0]) for each in (odometry, found))
-    T_map_odom = compose(begin, first.inverse())
+    T_map_odom = compose(found.pose(0), odometry.pose(0).inverse())
     R, p = T_map_odom.R @ odometry.R, odometry.p @ T_map_odom.R.T + T_map_odom.t
     return replace(odometry, R=R, p=p)
 

@@ -24,8 +24,6 @@ from l2m_gtsam.slam.options import DriftOptions
 
 CONTRADICTS = "a loop of scans is left out: it contradicts odometry and readings"
 PIECE_M = 0.05  # of path, in which a surface is made or two scans are registered one way
-# Along what a scan does not show a fix says nothing; more than this would drown in rounding.
-UNSEEN = {"unseen_m": 100.0, "unseen_deg": 100.0}
 
 
 @dataclass(frozen=True)
@@ -54,9 +52,8 @@ class ScanMatcher:
     def __init__(
         self, cloud: Surface, options: ScanLocalisationOptions, edge: float, drift: DriftOptions
     ) -> None:
-        registration = options.registration.model_copy(update=UNSEEN)
         self._cloud, self._edge, self._drift = cloud, edge, drift
-        self._options = options.model_copy(update={"registration": registration})
+        self._options = options.beside_odometry()
         self._path_m = np.inf  # since the last fix
 
     def fixes(
