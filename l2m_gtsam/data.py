@@ -146,6 +146,10 @@ class Trajectory:
     def __getitem__(self, rows: IntArray | BoolArray) -> "Trajectory":
         return chosen_rows(self, rows)
 
+    def pose(self, row: int) -> RigidTransform:
+        """Return one of the poses."""
+        return RigidTransform(self.R[row], self.p[row])
+
 
 @dataclass(frozen=True)
 class FieldSeries:

@@ -353,8 +353,8 @@ def scans_at(scans: Sequence[Scan], trajectory: Trajectory, row: int) -> tuple[S
     """Return scans as if taken at once, with their poses relative to that of a row."""
     stamps = np.array([each.stamp_ns for each in scans], dtype=np.int64)
     at, motion = interpolated(trajectory, stamps), twists(trajectory, stamps)
-    key = RigidTransform(trajectory.R[row], trajectory.p[row])
+    key = trajectory.pose(row)
     return tuple(
-        ScanAtKeyPose(taken_at_once(scan, twist), between(key, RigidTransform(at.R[k], at.p[k])))
+        ScanAtKeyPose(taken_at_once(scan, twist), between(key, at.pose(k)))
         for k, (scan, twist) in enumerate(zip(scans, motion, strict=True))
     )
