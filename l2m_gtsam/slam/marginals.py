@@ -8,7 +8,6 @@ from typing import Protocol, TypeVar
 
 import gtsam
 import numpy as np
-from scipy.linalg.lapack import dtrtri
 
 from l2m_factors import D, G, T, V, X
 from l2m_gtsam.calibration.joint_information import columns_at, slices_of
@@ -18,7 +17,7 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.localisation import OdometryScale, OdometryTurn
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.online.belief import POSE
-from l2m_gtsam.slam.selected_inverse import shared_covariances
+from l2m_gtsam.slam.selected_inverse import inverse_of, shared_covariances
 from l2m_gtsam.solve.linear_algebra import triangular_information_root
 
 Result = TypeVar("Result")
@@ -229,9 +228,7 @@ def covariance_of(root: FloatArray) -> FloatArray:
 
     GTSAM would invert ``R^T R`` by Cholesky, which squares the condition number again.
     """
-    half, singular = dtrtri(root)
-    if singular:
-        raise np.linalg.LinAlgError("no factor determines a variable")
+    half = inverse_of(root)
     return np.asarray(half @ half.T)
 
 
