@@ -16,7 +16,7 @@ odometry excludes is refused, and the drive goes on by odometry until the drive 
 key poses with their readings are kept, about a kilobyte of each.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -121,12 +121,17 @@ class OneFieldExplorer:
         Prior of the first key pose, and the sensor.
     options
         As of a localisation.
+
+    Attributes
+    ----------
+    key_poses
+        All so far.
     """
 
     def __init__(self, start: StartPose, sensors: KnownSensors, options: SlamOptions) -> None:
         self.start, self._sensors, self._options = start, sensors, _of_short_drives(options)
         self._origin = as_pose(start.T_map_lidar)
-        self._key_poses: list[ArrivedKeyPose] = []
+        self.key_poses: list[ArrivedKeyPose] = []
         self._path_m, self._learnt_m = 0.0, 0.0
         self._read = ReadPath()
         self._reckoned = DeadReckoning.at_start()
@@ -144,15 +149,10 @@ class OneFieldExplorer:
         """Whether the prior of the field is learnt; until then poses are those of odometry."""
         return self._now is not None
 
-    @property
-    def key_poses(self) -> Sequence[ArrivedKeyPose]:
-        """All so far."""
-        return self._key_poses
-
     def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior."""
         key_pose = key_pose.as_mixture
-        self._key_poses.append(key_pose)
+        self.key_poses.append(key_pose)
         self._count_path(key_pose)
         if key_pose.recorded is not None:
             self._open.append(key_pose.number)
@@ -179,7 +179,7 @@ class OneFieldExplorer:
     def poses(self) -> list[gtsam.Pose3]:
         """Return all key poses, each by the readings until then."""
         if self._now is None:
-            return self._drive(len(self._key_poses)).dead_reckoning()
+            return self._drive(len(self.key_poses)).dead_reckoning()
         return [self._origin.compose(each) for each in self._now.hypotheses.best.poses]
 
     def field_along_path(self) -> tuple[FloatArray, FloatArray]:
@@ -212,7 +212,7 @@ class OneFieldExplorer:
         prior = None if self._now is None else self._now.prior
         beginning = None if self._now is None else self._now.beginning
         decisions = tuple(self._decisions.values())
-        return OneFieldState(tuple(self._key_poses), prior, beginning, self._learnt_m, decisions)
+        return OneFieldState(tuple(self.key_poses), prior, beginning, self._learnt_m, decisions)
 
     @classmethod
     def resumed(
@@ -224,7 +224,7 @@ class OneFieldExplorer:
             own._count_path(each)
             own._dead_reckon(each)
         own._decisions = {each.number: each for each in state.decisions}
-        own._key_poses = list(state.key_poses)
+        own.key_poses = list(state.key_poses)
         doubts = [each.number for each in state.key_poses if each.recorded is not None]
         own._open = [number for number in doubts if number not in own._decisions]
         own._learnt_m = state.learnt_m
@@ -268,7 +268,7 @@ class OneFieldExplorer:
         recorded = self._recorded
         chosen = [
             each if each.recorded is None or each.number not in recorded else each.recorded
-            for each in self._key_poses[:count]
+            for each in self.key_poses[:count]
         ]
         return drive_of(chosen, self.start, self._sensors)
 
@@ -278,7 +278,7 @@ class OneFieldExplorer:
         if not (self._read.is_enough and is_long):
             return None
         inside = now is not None and _is_inside(now)
-        if inside and len(self._key_poses) > MOST:
+        if inside and len(self.key_poses) > MOST:
             return None
         growth = GROWN if inside else LEFT
         return self._learning(now) if self._path_m >= growth * self._learnt_m else None
@@ -287,7 +287,7 @@ class OneFieldExplorer:
         """Solve the drive so far, and follow the rest, in pieces."""
         self._learnt_m = self._path_m
         # A step that nothing has decided yet is followed both ways.
-        count = min([len(self._key_poses), *self._open])
+        count = min([len(self.key_poses), *self._open])
         recorded = frozenset(each for each in self._recorded if each < count)
         drive = self._drive(count)
         solvable = LEAST <= count <= MOST and len(drive.readings) >= FEWEST
@@ -302,7 +302,7 @@ class OneFieldExplorer:
             yield None
             yield from self._following(smooth.prior, beginning)
             return
-        options, everything = self._options.whole_field, self._drive(len(self._key_poses))
+        options, everything = self._options.whole_field, self._drive(len(self.key_poses))
         first, poses = None if now is None else now.prior.spectrum, self.poses()
         spectrum = spectrum_at(everything, poses, options, COARSE, first)
         yield None
@@ -316,7 +316,7 @@ class OneFieldExplorer:
             return True
         if np.abs(state.steady - self._drifting.drift).max() > NEAR_DRIFT:
             self._drifting = DeadReckoning.at_start(state.steady)
-            for each in self._key_poses[1:]:
+            for each in self.key_poses[1:]:
                 self._drifting = self._drifting.after(step_of(each))
         return self._drifting.squared_distance(state.pose) <= IMPOSSIBLE
 
@@ -341,8 +341,8 @@ class OneFieldExplorer:
             known = Hypothesis(beginning.state, beginning.poses, beginning.recorded)
             hypotheses, done = Hypotheses((known,)), len(beginning.poses)
         anew = FollowedField(prior, beginning, follows, hypotheses)
-        while done < len(self._key_poses):
-            anew = self._after(anew, self._key_poses[done])
+        while done < len(self.key_poses):
+            anew = self._after(anew, self.key_poses[done])
             done += 1
             if done % PIECE == 0:
                 yield None
