@@ -139,18 +139,10 @@ def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) ->
 class WaveTile(LinearField):
     """Uniform field, floor and ceiling waves of a level box about an anchor, in its frame.
 
-    Attributes
-    ----------
-    basis
-        m basis functions.
-    scale
-        Prior standard deviation of each one's weight, shape (m,).
-    prior
-        From which they follow.
+    ``prior`` is that from which both follow.
     """
 
     basis: Basis
-    scale: FloatArray
     prior: FieldPrior
 
     @classmethod
@@ -177,19 +169,6 @@ class WaveTile(LinearField):
         learnt = np.exp(0.5 * basis.prior(prior.hyperparameters).log_variance)
         wider = np.append(np.ones(3), np.full(len(basis) - 3, WIDER))  # the uniform field is wide
         return cls(basis, wider * learnt, prior)
-
-    def __len__(self) -> int:
-        return len(self.scale)
-
-    def features(self, points: FloatArray, /) -> FloatArray:
-        """Return the field of weights of unit prior variance in uT, shape (N, 3, m)."""
-        return self.basis.features(points) * self.scale
-
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray, /
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
-        return self.basis.field_and_gradient(points, self.scale * weights)
 
     @property
     def half_wave(self) -> float:

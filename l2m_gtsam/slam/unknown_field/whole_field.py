@@ -54,33 +54,14 @@ COARSE, FINE = FieldDetail(200, 3.0), FieldDetail(600, 4.0)
 
 @dataclass(frozen=True)
 class WholeField(LinearField):
-    """The field of a drive in the frame of its first key pose.
-
-    Attributes
-    ----------
-    basis
-        Eigenfunctions in the box.
-    """
+    """The field of a drive in the frame of its first key pose, of eigenfunctions in a box."""
 
     basis: PotentialBasis
 
-    def __len__(self) -> int:
-        return len(self.basis)
-
-    @property
-    def scale(self) -> FloatArray:
-        """Prior standard deviation of each weight, shape (m,)."""
-        return np.asarray(np.sqrt(self.basis.variance))
-
-    def features(self, points: FloatArray, /) -> FloatArray:
-        """Return the field of weights of unit prior variance in uT, shape (N, 3, m)."""
-        return self.basis.features(points) * self.scale
-
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray, /
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
-        return self.basis.field_and_gradient(points, self.scale * weights)
+    @classmethod
+    def of(cls, basis: PotentialBasis) -> "WholeField":
+        """Return the field of eigenfunctions, whose weights have the variances that these state."""
+        return cls(basis, np.sqrt(basis.variance))
 
     def by_points(self, points: FloatArray, by_features: FloatArray) -> FloatArray:
         """Return the derivative of a scalar by points (N, 3), of one by features (N, 3, m)."""
@@ -123,7 +104,7 @@ class WholePrior:
     def field(self) -> WholeField:
         """The field in the box."""
         basis = PotentialBasis.over(self.low, self.high, self.spectrum.prior, self.waves)
-        return WholeField(basis)
+        return WholeField.of(basis)
 
     def capped(self, most: int) -> "WholePrior":
         """Return it with so many eigenfunctions at most: what shorter waves hold is noise."""
