@@ -22,7 +22,7 @@ from l2m_factors import D, KeyPoseReadings, MapBatch, StepError, T, Whitening, X
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose, as_transform
-from l2m_gtsam.slam.joint_gaussian import JointGaussian, prior_factors
+from l2m_gtsam.slam.joint_gaussian import of_key_pose, prior_factors
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.map_prediction import sensors_in
@@ -49,7 +49,6 @@ from l2m_gtsam.slam.pose_graph import (
 )
 from l2m_gtsam.solve.robust import RobustOptions
 
-POSITION, DISTORTION = 3, 12  # components of a sensor's variables
 AXES = 3
 SECTION = 200  # key poses that are solved together
 GROUP = 10  # key poses that are added to iSAM2 together,
@@ -164,20 +163,13 @@ class Follower:
     ) -> "Follower":
         """Return a follower that goes on from what was known of a key pose."""
         belief, number = last.belief, last.number
-        pose = belief.pose
-        T_map_lidar = as_transform(pose)
-        start = StartPose(T_map_lidar, belief.pose_covariance)
+        start = StartPose(as_transform(belief.pose), belief.pose_covariance)
         own = cls(start, belief.sensors, field_map, robust, over_m, free=free)
-        values, sizes = gtsam.Values(), {X(number): POSE}
-        values.insert(X(number), pose)
-        if free:
-            values.insert(calibration_values(belief.sensors))
-            for i in range(len(belief.sensors.names)):
-                sizes |= {T(i): POSITION, D(i): DISTORTION}
-        prior = prior_factors(JointGaussian(values, sizes, belief.covariance))
+        sensors = belief.sensors if free else None
+        known = of_key_pose(number, belief.pose, sensors, belief.covariance)
         own.belief, own._pending, own._drift = belief, PendingKeyPoses(), last.drift
         own._first = own._last = number
-        own._section.add(prior, values, number, 0)
+        own._section.add(prior_factors(known), known.values, number, 0)
         return own
 
     def forked(self) -> "Follower":
