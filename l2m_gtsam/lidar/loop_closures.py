@@ -124,11 +124,7 @@ def candidates(kept: Sequence[KeyScan], here: KeyScan, options: LoopOptions) -> 
 
 
 def closing_loop(
-    earlier: KeyScan,
-    here: KeyScan,
-    first: Surface,
-    scan: Surface,
-    options: RegistrationOptions,
+    earlier: KeyScan, here: KeyScan, first: Surface, scan: Surface, options: RegistrationOptions
 ) -> Generator[None, None, LoopClosure | Refusal]:
     """Return the loop closure between two scans, or why there is none.
 

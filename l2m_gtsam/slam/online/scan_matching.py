@@ -181,10 +181,7 @@ class LoopMatcher:
         self._work: Iterator[Links | str | None] = iter(())  # what is left of comparing it
 
     def loops(
-        self,
-        key_pose: ArrivedKeyPose,
-        expected: PoseEstimate,
-        known: Callable[[int], PoseEstimate],
+        self, key_pose: ArrivedKeyPose, expected: PoseEstimate, known: Callable[[int], PoseEstimate]
     ) -> ScanLinks:
         """Return the loops of a key pose that are found by now, and keep a scan of a new place.
 

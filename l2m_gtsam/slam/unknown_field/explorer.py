@@ -187,11 +187,7 @@ class Explorer:
 
     @classmethod
     def resumed(
-        cls,
-        state: "ExplorerState",
-        start: StartPose,
-        sensors: KnownSensors,
-        options: SlamOptions,
+        cls, state: "ExplorerState", start: StartPose, sensors: KnownSensors, options: SlamOptions
     ) -> "Explorer":
         """Return an explorer that goes on from a state; other parameters are those of the class."""
         own = cls(start, sensors, options)

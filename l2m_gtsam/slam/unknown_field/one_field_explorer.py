@@ -33,12 +33,7 @@ from l2m_gtsam.slam.unknown_field.field_filter import DeadReckoning, FieldFilter
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import Hypotheses, Hypothesis, step_of
 from l2m_gtsam.slam.unknown_field.read_path import ReadPath
 from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, end_state, smoothed
-from l2m_gtsam.slam.unknown_field.whole_field import (
-    COARSE,
-    WholePrior,
-    full_prior,
-    spectrum_at,
-)
+from l2m_gtsam.slam.unknown_field.whole_field import COARSE, WholePrior, full_prior, spectrum_at
 from l2m_gtsam.solve.chi_square import exceeded_by
 
 # Of the filter's noise. Slow errors count as white there: of errors that last 3 to 4 s, with a

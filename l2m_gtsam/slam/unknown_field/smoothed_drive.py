@@ -37,11 +37,7 @@ from l2m_gtsam.slam.unknown_field.path_information import PathNeighbourhood, det
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.tiled_smoother import TiledProblem, TiledRound
-from l2m_gtsam.slam.unknown_field.whole_field import (
-    WholePrior,
-    fine_prior,
-    learnt_prior,
-)
+from l2m_gtsam.slam.unknown_field.whole_field import WholePrior, fine_prior, learnt_prior
 
 CONVEX = 1.0  # of the loss, with weights at the poses of the filter
 # Factors of the noise. With the noise alone the likelihood has maxima between the poses of odometry

@@ -15,11 +15,7 @@ from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn, maximise
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
-from l2m_gtsam.maps.harmonic.tiling import (
-    Resolution,
-    resolution_of,
-    surveyed_area,
-)
+from l2m_gtsam.maps.harmonic.tiling import Resolution, resolution_of, surveyed_area
 from l2m_gtsam.maps.training import TrainingSet, cubes_of, merged, training_set
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
