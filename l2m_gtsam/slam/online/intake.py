@@ -225,14 +225,14 @@ class Intake:
         """Report a step over a gap, or one that the motion before does not explain."""
         state = self.state
         found = suspect_step(before, pose, state.velocity, self._options)
-        if self._options.drift.axes is StepAxes.FIXED and found is not None and not found.is_gap:
-            found = None  # a step that went on with the motion before would shift all that follow
-        step = velocity(before, pose)
-        # A turn that goes on looks like a jump once: its next step is like the one before it.
-        again = found is not None and found.kind is EventKind.ODOMETRY_JUMP
-        if again and suspect_step(before, pose, state.last_velocity, self._options) is None:
-            found = None if np.isfinite(state.last_velocity).all() else found
-        state.last_velocity = step
+        if found is not None and found.kind is EventKind.ODOMETRY_JUMP:
+            last = state.last_velocity
+            if self._options.drift.axes is StepAxes.FIXED:
+                found = None  # one that went on with the motion before would shift all that follow
+            # A turn that goes on looks like a jump once: its next step is like the one before it.
+            elif np.isfinite(last).all() and not suspect_step(before, pose, last, self._options):
+                found = None
+        step = state.last_velocity = velocity(before, pose)
         if found is None:
             state.velocity = step
             return
