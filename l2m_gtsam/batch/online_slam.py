@@ -223,12 +223,11 @@ def _matcher(bag: Path, saved: SavedMap | None, config: Config) -> ScanMatcher |
         return None
     if saved is None:
         library("small_gicp")  # or it is missed where the first scan is registered
-        loops, largest = config.lidar.loops, slam.robust.largest_of(POSE)
-        return LoopMatcher(loops, loops.registration.edge, slam.drift, largest)
-    mapped, options = saved.state.lidar, config.lidar.localisation
+        return LoopMatcher(config.lidar.loops, slam.drift, slam.robust.largest_of(POSE))
+    mapped = saved.state.lidar
     if mapped is None:
         return None
-    return ScanMatcher(Surface(mapped.points), options, options.registration.edge, slam.drift)
+    return ScanMatcher(Surface(mapped.points), config.lidar.localisation, slam.drift)
 
 
 class _Run:

@@ -39,6 +39,7 @@ from l2m_gtsam.slam.online.measurements import (
 )
 from l2m_gtsam.slam.online.section import Section
 from l2m_gtsam.slam.online.tracked_drift import TrackedDrift
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
     between_factor,
     calibration_graph,
@@ -47,7 +48,6 @@ from l2m_gtsam.slam.pose_graph import (
     link_pose,
     start_factor,
 )
-from l2m_gtsam.solve.robust import RobustOptions
 
 AXES = 3
 SECTION = 200  # key poses that are solved together
@@ -112,12 +112,9 @@ class Follower:
         Calibrations.
     field_map
         Map that is queried for field and variance.
-    robust
-        Loss and confidence of the gate.
-    over_m
-        The distance over which what is left of a steady drift of odometry counts as a random walk.
-    free
-        Whether calibrations are variables.
+    options
+        Loss and confidence of the gate; calibrations are variables if they are ``refined``. Over
+        ``drift.over_m`` what is left of a steady drift of odometry counts as a random walk.
     section
         Key poses that are solved together.
 
@@ -132,15 +129,13 @@ class Follower:
         start: StartPose,
         sensors: KnownSensors,
         field_map: QueryableMap,
-        robust: RobustOptions,
-        over_m: float,
-        *,
-        free: bool,
+        options: SlamOptions,
         section: int = SECTION,
     ) -> None:
-        self._sensors, self._map, self._robust, self._free = sensors, field_map, robust, free
+        self._sensors, self._map, self._options = sensors, field_map, options
+        self._robust, self._free = options.robust, options.calibration is CalibrationUse.REFINED
         self._variance = CachedVariance(field_map)
-        numbers = range(len(sensors.names) if free else 0)
+        numbers = range(len(sensors.names) if self._free else 0)
         self._calibrations = [key for i in numbers for key in (T(i), D(i))]
         self._length, self._first, self._last = section, 0, -1
         self._past = gtsam.Values()
@@ -149,23 +144,17 @@ class Follower:
         self.log_likelihood = 0.0  # of readings and scans so far, each against being an outlier
         self._section = Section(self._calibrations)
         self.belief, self._pending = self._prior(start), self._opening(start)
-        self._drift = TrackedDrift.at_start(over_m, self.belief)
+        self._drift = TrackedDrift.at_start(options.drift.over_m, self.belief)
 
     @classmethod
     def resumed(
-        cls,
-        last: "LastBelief",
-        field_map: QueryableMap,
-        robust: RobustOptions,
-        over_m: float,
-        *,
-        free: bool,
+        cls, last: "LastBelief", field_map: QueryableMap, options: SlamOptions
     ) -> "Follower":
         """Return a follower that goes on from what was known of a key pose."""
         belief, number = last.belief, last.number
         start = StartPose(as_transform(belief.pose), belief.pose_covariance)
-        own = cls(start, belief.sensors, field_map, robust, over_m, free=free)
-        sensors = belief.sensors if free else None
+        own = cls(start, belief.sensors, field_map, options)
+        sensors = belief.sensors if own._free else None
         known = of_key_pose(number, belief.pose, sensors, belief.covariance)
         own.belief, own._pending, own._drift = belief, PendingKeyPoses(), last.drift
         own._first = own._last = number
@@ -175,9 +164,7 @@ class Follower:
     def forked(self) -> "Follower":
         """Return another follower that goes on from the last key pose."""
         self.finish()
-        own = Follower.resumed(
-            self.last, self._map, self._robust, self._drift.over_m, free=self._free
-        )
+        own = Follower.resumed(self.last, self._map, self._options)
         own.seen, own.used, own.fixes_refused = self.seen, self.used, self.fixes_refused
         own.log_likelihood = self.log_likelihood
         return own

@@ -37,7 +37,7 @@ from l2m_gtsam.slam.online.online_pose import OnlinePose
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanLinks, ScanMatcher
 from l2m_gtsam.slam.online.start_search import StartSearchState
 from l2m_gtsam.slam.online.step_doubts import StepDecision
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, refuse_offline_only
+from l2m_gtsam.slam.options import SlamOptions, refuse_offline_only
 from l2m_gtsam.slam.slips import FAR_M
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
@@ -195,9 +195,7 @@ class OnlineSlam:
         return StartSearchState(start_pose(first, self.options.start), waiting, window_m)
 
     def _follower(self, start: StartPose) -> BranchedFollower:
-        free, robust = self.options.calibration is CalibrationUse.REFINED, self.options.robust
-        over_m = self.options.drift.over_m
-        follower = Follower(start, self.sensors, self.known_map(), robust, over_m, free=free)
+        follower = Follower(start, self.sensors, self.known_map(), self.options)
         return BranchedFollower(Branch(follower))
 
     def known_map(self) -> QueryableMap:
