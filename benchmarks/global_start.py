@@ -12,10 +12,10 @@ from benchmarks.timing import seconds
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
-from l2m_gtsam.data import FloatArray, KnownSensor, Readings
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Trajectory
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.records.calibration import FoundStart
-from tests.worlds.exact import DipoleWorld, drive, random_sensors
+from tests.worlds.exact import DipoleWorld, drive, random_sensors, read_together
 
 SENSORS, READINGS = 12, 2_000
 WRONG = 0.1  # share of the readings, off by 50 uT and more
@@ -43,20 +43,8 @@ def report() -> Table:
 def array_drive(sensors: tuple[KnownSensor, ...], world: DipoleWorld) -> Readings:
     """Return what an array reads together: all sensors at the same poses."""
     path = drive(2, sensors[:1], world, count=READINGS)
-    R, p = path.R_map_lidar, path.p_map_lidar
-    rng, fields = np.random.default_rng(4), []
-    for sensor in sensors:
-        B, _ = world.field_and_gradient(R @ sensor.t_lidar_mag + p)
-        b = np.einsum("nji,nj->ni", R, B)
-        fields.append(sensor.distortion.apply(b) + NOISE * rng.standard_normal(b.shape))
-    return Readings(
-        tuple(sensor.sensor for sensor in sensors),
-        np.repeat(np.arange(len(sensors)), READINGS),
-        np.tile(path.stamp_ns, len(sensors)),
-        np.tile(R, (len(sensors), 1, 1)),
-        np.tile(p, (len(sensors), 1)),
-        np.concatenate(fields),
-    )
+    poses = Trajectory(path.stamp_ns, path.R_map_lidar, path.p_map_lidar, "map", "lidar")
+    return read_together(sensors, world, poses, np.random.default_rng(4), NOISE)
 
 
 def starts(readings: Readings, field_map: CompiledMap) -> FloatArray:

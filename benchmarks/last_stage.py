@@ -22,11 +22,11 @@ from l2m_gtsam.calibration.optimise import LinearSolver
 from l2m_gtsam.calibration.uncertain_graph import UncertainDrive, UncertainProblem, starting_values
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import observe
-from l2m_gtsam.data import FloatArray, KnownSensor, Readings
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Trajectory
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from tests.reference.elimination import Eliminated, eliminate
-from tests.worlds.exact import DipoleWorld, random_sensors
+from tests.worlds.exact import DipoleWorld, random_sensors, read_together
 
 OPTIONS = OneKeyOptions()
 GROWTH = ((12, 2_000), (12, 8_000), (1, 2_000), (4, 2_000), (48, 2_000))  # sensors, readings
@@ -84,17 +84,8 @@ def laps(sensors: tuple[KnownSensor, ...], world: DipoleWorld, count: int) -> Re
         [5 * phase + np.sin(7 * phase), 0.15 * np.sin(13 * phase), 0.15 * np.cos(9 * phase)]
     )
     R = Rotation.from_euler("ZYX", angles).as_matrix()
-    rng, fields = np.random.default_rng(3), []
-    for known in sensors:
-        B, _ = world.field_and_gradient(R @ known.t_lidar_mag + p)
-        b = np.einsum("nji,nj->ni", R, B)
-        fields.append(known.distortion.apply(b) + rng.normal(0, NOISE, b.shape))
-    n = len(sensors)
-    stamps = np.tile(np.linspace(0, 100e9, count).astype(np.int64), n)
-    sensor = np.repeat(np.arange(n), count)
-    poses = np.tile(R, (n, 1, 1)), np.tile(p, (n, 1))
-    names = tuple(known.sensor for known in sensors)
-    return Readings(names, sensor, stamps, *poses, np.concatenate(fields))
+    poses = Trajectory(np.linspace(0, 100e9, count).astype(np.int64), R, p, "map", "lidar")
+    return read_together(sensors, world, poses, np.random.default_rng(3), NOISE)
 
 
 def case(field_map: CompiledMap, count: int, each: int) -> Case:
