@@ -246,10 +246,8 @@ class Intake:
         poses, state = self.state.poses, self.state
         if not poses:
             return None
-        if state.number == 0:
-            return (
-                0 if at_end or len(poses) > 1 else None
-            )  # the next may say that its stamp is wrong
+        if state.number == 0:  # the next pose may say that the stamp of the first is wrong
+            return 0 if at_end or len(poses) > 1 else None
         delay = 0 if at_end else round(self._online.delay_s / NS)
         for row in range(self._looked_at, len(poses)):
             if self._is_key_pose(row):

@@ -26,11 +26,10 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.slam.options import StartSearchOptions
-from l2m_gtsam.slam.start.window import Pattern
+from l2m_gtsam.slam.start.window import AXES, Pattern
 
 MOST_BOX = 10_000_000  # nodes; those that the map has data for take 150 bytes each
 NEAR = 1.0  # metres from a reading of the survey: further off no map is asked
-AXES = 3
 FURTHEST = np.sqrt(AXES) / 2  # steps from a place to its nearest node
 LARGEST = 16.0  # of a squared residual in sigmas: passed once in a thousand readings by noise
 MEAN = 3.0  # of it, by noise

@@ -87,14 +87,7 @@ class OpenSection:
 
     def begun_anew(self) -> "OpenSection":
         """Return the same section without key poses, as which other ones may be solved."""
-        return OpenSection(
-            self._sensors,
-            self.field_prior,
-            self._options,
-            self._memory,
-            self._first,
-            self._tiles_before,
-        )
+        return self._anew(self._memory, self._first, self._tiles_before)
 
     def log_likelihood(self) -> float:
         """Return that of its readings, poses and field integrated out about the solution.
@@ -186,8 +179,10 @@ class OpenSection:
 
     def next(self, memory: FieldMemory, first: int) -> "OpenSection":
         """Return a new section from a key pose on."""
-        tiles = frozenset(self._tile_of.values())
-        return OpenSection(self._sensors, self.field_prior, self._options, memory, first, tiles)
+        return self._anew(memory, first, frozenset(self._tile_of.values()))
+
+    def _anew(self, memory: FieldMemory, first: int, before: Set[int]) -> "OpenSection":
+        return OpenSection(self._sensors, self.field_prior, self._options, memory, first, before)
 
     def pose(self, number: int) -> gtsam.Pose3:
         """Return the estimate of a key pose of the section, or of the memory."""

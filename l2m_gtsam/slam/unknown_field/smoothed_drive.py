@@ -27,7 +27,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import Drive, KnownSensors, as_pose, stacked
 from l2m_gtsam.slam.odometry import FixedStep
-from l2m_gtsam.slam.online.belief import POSE
+from l2m_gtsam.slam.online.belief import POSE, SENSOR
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, WholeFieldOptions
 from l2m_gtsam.slam.relative_motion import from_end
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
@@ -48,7 +48,6 @@ CLOSE = 0.5  # decrease of the error that moves poses by less than their sigmas
 # Sigmas of the ship's poses are 5 to 16 % larger than with 120, heights 26 %, in less than half the
 # time.
 VECTORS = 50
-SENSOR = 15
 
 
 @dataclass(frozen=True)
