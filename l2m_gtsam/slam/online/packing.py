@@ -95,7 +95,9 @@ def _packed_fixed(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
 
 def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
     """Return key poses of ``packed_key_poses``."""
-    readings = KeyPoseReadings(**under("reading", arrays))
+    columns = under("reading", arrays)
+    key, sensor, R, p, fraction, field = (columns[name] for name in READINGS)
+    readings = KeyPoseReadings(key, sensor, R, p, fraction, field)
     links = Links(**under("link", arrays))
     fixed = under("fixed", arrays)
     turning = arrays.get("turning", np.zeros((len(arrays["number"]), 3)))  # older states have none
