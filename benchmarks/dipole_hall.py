@@ -6,7 +6,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, Readings
+from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from tests.worlds.exact import DipoleWorld
 
@@ -41,30 +41,6 @@ def compiled_map(world: DipoleWorld) -> CompiledMap:
     """Return the harmonic map of a survey, compiled."""
     data = survey(world, 8000)
     return HarmonicMap.fit(data.points, data.field).compile()
-
-
-def read_together(
-    sensors: tuple[KnownSensor, ...],
-    world: DipoleWorld,
-    R: FloatArray,
-    p: FloatArray,
-    stamp_ns: IntArray,
-    seed: int,
-) -> Readings:
-    """Return what sensors read at the same poses, (N, 3, 3) and (N, 3), with noise."""
-    rng, fields, count = np.random.default_rng(seed), [], len(sensors)
-    for known in sensors:
-        B, _ = world.field_and_gradient(R @ known.t_lidar_mag + p)
-        b = np.einsum("nji,nj->ni", R, B)
-        fields.append(known.distortion.apply(b) + rng.normal(0, NOISE, b.shape))
-    return Readings(
-        tuple(known.sensor for known in sensors),
-        np.repeat(np.arange(count), len(p)),
-        np.tile(stamp_ns, count),
-        np.tile(R, (count, 1, 1)),
-        np.tile(p, (count, 1)),
-        np.concatenate(fields),
-    )
 
 
 def true_start(sensors: tuple[KnownSensor, ...], options: OneKeyOptions) -> Estimate:

@@ -7,15 +7,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.dipole_hall import compiled_map, hall, read_together
+from benchmarks.dipole_hall import NOISE, compiled_map, hall
 from benchmarks.timing import seconds
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
-from l2m_gtsam.data import FloatArray, KnownSensor, Readings
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Trajectory
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap
 from l2m_gtsam.records.calibration import FoundStart
-from tests.worlds.exact import DipoleWorld, drive, random_sensors
+from tests.worlds.exact import DipoleWorld, drive, random_sensors, read_together
 
 SENSORS, READINGS = 12, 2_000
 WRONG = 0.1  # share of the readings, off by 50 uT and more
@@ -42,8 +42,8 @@ def report() -> Table:
 def array_drive(sensors: tuple[KnownSensor, ...], world: DipoleWorld) -> Readings:
     """Return what an array reads together: all sensors at the same poses."""
     path = drive(2, sensors[:1], world, count=READINGS)
-    poses = path.R_map_lidar, path.p_map_lidar, path.stamp_ns
-    return read_together(sensors, world, *poses, seed=4)
+    poses = Trajectory(path.stamp_ns, path.R_map_lidar, path.p_map_lidar, "map", "lidar")
+    return read_together(sensors, world, poses, np.random.default_rng(4), NOISE)
 
 
 def starts(readings: Readings, field_map: CompiledMap) -> FloatArray:

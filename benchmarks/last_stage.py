@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.dipole_hall import compiled_map, hall, read_together, true_start
+from benchmarks.dipole_hall import NOISE, compiled_map, hall, true_start
 from benchmarks.timing import seconds
 from l2m_factors import map_weights_prior
 from l2m_gtsam.calibration.alternation import OneKeyOptions
@@ -26,11 +26,11 @@ from l2m_gtsam.calibration.uncertain_graph import (
 )
 from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import observe
-from l2m_gtsam.data import FloatArray, KnownSensor, Readings
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Trajectory
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from tests.reference.elimination import Eliminated, eliminate
-from tests.worlds.exact import DipoleWorld, random_sensors
+from tests.worlds.exact import DipoleWorld, random_sensors, read_together
 
 OPTIONS = OneKeyOptions()
 GROWTH = ((12, 2_000), (12, 8_000), (1, 2_000), (4, 2_000), (48, 2_000))  # sensors, readings
@@ -88,8 +88,8 @@ def laps(sensors: tuple[KnownSensor, ...], world: DipoleWorld, count: int) -> Re
         [5 * phase + np.sin(7 * phase), 0.15 * np.sin(13 * phase), 0.15 * np.cos(9 * phase)]
     )
     R = Rotation.from_euler("ZYX", angles).as_matrix()
-    stamps = np.linspace(0, 100e9, count).astype(np.int64)
-    return read_together(sensors, world, R, p, stamps, seed=3)
+    poses = Trajectory(np.linspace(0, 100e9, count).astype(np.int64), R, p, "map", "lidar")
+    return read_together(sensors, world, poses, np.random.default_rng(3), NOISE)
 
 
 def case(field_map: CompiledMap, count: int, each: int) -> Case:

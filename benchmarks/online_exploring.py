@@ -109,7 +109,7 @@ def driven(seed: int, seconds: float, *, by_scans: bool) -> Run:
     given: Iterator[Message] = messages(drive.recording)
     if by_scans:
         largest = OPTIONS.robust.largest_of(6)
-        matcher = LoopMatcher(LoopOptions(), 0.25, OPTIONS.drift, largest)
+        matcher = LoopMatcher(LoopOptions(), OPTIONS.drift, largest)
         given = with_scans(given, scans_of(drive, seed))
     slam, warm, truth = OnlineSlam(start, OPTIONS, None, matcher), None, drive.truth
     made, costs = [], []  # without calibrations, which would fill the memory

@@ -19,8 +19,7 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.slam.online.follower import SECTION, Follower
 from l2m_gtsam.slam.online.key_pose import key_poses_of
-from l2m_gtsam.slam.options import DriftOptions
-from l2m_gtsam.solve.robust import RobustOptions
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.worlds.exact import random_sensors
 
@@ -65,9 +64,9 @@ def laps(count: int) -> Trajectory:
 
 def followed(drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: int = SECTION) -> Run:
     """Follow a drive and take the time of each key pose."""
-    drive, robust, over_m = drawn.drive, RobustOptions(), DriftOptions().over_m
-    start, sensors = drive.start, drive.sensors
-    follower = Follower(start, sensors, field_map, robust, over_m, free=free, section=section)
+    use = CalibrationUse.REFINED if free else CalibrationUse.FIXED
+    drive, options = drawn.drive, SlamOptions(calibration=use)
+    follower = Follower(drive.start, drive.sensors, field_map, options, section)
     count, warm = len(drawn.drive), len(drawn.drive) // 10
     cost, off, memory = np.zeros(count), np.zeros(count), 0.0
     for number, key_pose in enumerate(key_poses_of(drive)):

@@ -157,6 +157,10 @@ class Trajectory(TimedTable):
     child_frame: str
     covariance: FloatArray | None = None
 
+    def pose(self, row: int) -> RigidTransform:
+        """Return one of the poses."""
+        return RigidTransform(self.R[row], self.p[row])
+
 
 @dataclass(frozen=True)
 class FieldSeries(TimedTable):

@@ -20,10 +20,11 @@ from l2m_gtsam.batch.slam import (
     calibration_notes,
     check_not_replaced,
     map_provenance,
+    opened,
     write_refined,
 )
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import FloatArray, Recording, RigidTransform, Trajectory
+from l2m_gtsam.data import FloatArray, Recording, Trajectory
 from l2m_gtsam.errors import LidarError, SyncError
 from l2m_gtsam.geometry import compose
 from l2m_gtsam.lidar.surface import Surface, library
@@ -135,7 +136,7 @@ def slam_online(
         raise SyncError(f"{given.bag}: odometry of one pose; two or more are needed")
     if truth is not None:
         check_truth(truth, recording.trajectory, config.slam.max_pose_gap_s, str(given.truth))
-    field_map = None if saved is None else _opened(saved, recording, config, progress)
+    field_map = None if saved is None else opened(saved, recording, config, progress)
     matcher, ignored = _matcher_or_why_not(given.bag, saved, config)
     still = without_moving_fields(recording, calibration, config.slam.regressors)
     begun = _begun(still.calibration, config, field_map, matcher, out, resume=resume)
@@ -200,10 +201,6 @@ def _begun(
     return _Begun(slam, lines, after)
 
 
-def _opened(saved: SavedMap, recording: Recording, config: Config, progress: Progress) -> FieldMap:
-    return saved.open(progress, [recording] if config.slam.start.by_odometry else [])
-
-
 def _matcher_or_why_not(
     bag: Path, saved: SavedMap | None, config: Config
 ) -> tuple[ScanMatcher | LoopMatcher | None, str | None]:
@@ -226,12 +223,11 @@ def _matcher(bag: Path, saved: SavedMap | None, config: Config) -> ScanMatcher |
         return None
     if saved is None:
         library("small_gicp")  # or it is missed where the first scan is registered
-        loops, largest = config.lidar.loops, slam.robust.largest_of(POSE)
-        return LoopMatcher(loops, loops.registration.edge, slam.drift, largest)
-    mapped, options = saved.state.lidar, config.lidar.localisation
+        return LoopMatcher(config.lidar.loops, slam.drift, slam.robust.largest_of(POSE))
+    mapped = saved.state.lidar
     if mapped is None:
         return None
-    return ScanMatcher(Surface(mapped.points), options, options.registration.edge, slam.drift)
+    return ScanMatcher(Surface(mapped.points), config.lidar.localisation, slam.drift)
 
 
 class _Run:
@@ -317,8 +313,7 @@ def _write_map_so_far(
 
 def in_map(odometry: Trajectory, found: Trajectory) -> Trajectory:
     """Return odometry at the same times as found poses, from the first of these on."""
-    first, begin = (RigidTransform(each.R[0], each.p[0]) for each in (odometry, found))
-    T_map_odom = compose(begin, first.inverse())
+    T_map_odom = compose(found.pose(0), odometry.pose(0).inverse())
     R, p = T_map_odom.R @ odometry.R, odometry.p @ T_map_odom.R.T + T_map_odom.t
     return replace(odometry, R=R, p=p)
 

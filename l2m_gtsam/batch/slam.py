@@ -1,5 +1,6 @@
 """Drives localised in a map, or in the field that they meet, with scans beside odometry."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from itertools import chain
@@ -13,12 +14,13 @@ from l2m_gtsam.batch.reports import REPORT_FILE, SLAM_FILE, write_slam_report
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow, scan_start
 from l2m_gtsam.batch.software import versions
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import LidarMap, Recording, RigidTransform, SourceFile
+from l2m_gtsam.data import LidarMap, Recording, SourceFile
 from l2m_gtsam.errors import LidarError, MapError, OutputError
 from l2m_gtsam.geometry import compose
 from l2m_gtsam.lidar.loop_closures import find_loop_closures
+from l2m_gtsam.lidar.odometry import ScanStep
 from l2m_gtsam.lidar.registration import PoseEstimate
-from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, localise_scans, spaced
+from l2m_gtsam.lidar.scan_localisation import localise_scans, spaced
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
@@ -31,7 +33,7 @@ from l2m_gtsam.recording.sync import twists
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.localisation_file import LocalisationRecord
-from l2m_gtsam.records.scans import ScanEvidence
+from l2m_gtsam.records.scans import PoseFix, ScanEvidence
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import NO_SCANS, localise, start_pose
@@ -48,10 +50,6 @@ from l2m_gtsam.storage.pose_files import read_tum
 from l2m_gtsam.storage.record_files import record_id, write_slam
 from l2m_gtsam.storage.result_set import published
 from l2m_gtsam.storage.trajectory_files import LocalisedMotion, write_trajectory_bag, write_tum
-
-# Along what a scan does not show a fix says nothing, nor do some hundreds of them; more than this
-# beside the millimetres of what it shows would drown in rounding.
-UNSEEN = {"unseen_m": 100.0, "unseen_deg": 100.0}
 
 
 @dataclass(frozen=True)
@@ -87,30 +85,23 @@ def read_evidence(
     """
     if config.slam.scans is Usage.IGNORED or not has_clouds(bag):
         return Scanned()
+    mapped = None if saved is None else saved.state.lidar
+    options = config.lidar.loops if mapped is None else config.lidar.localisation
     try:
-        mapped = None if saved is None else saved.state.lidar
+        scans = bag_scans(bag, config, progress)
+        repaired = without_jumps(recording.trajectory, config.slam.jumps)
+        steps = scan_odometry(scans, repaired, options.registration.edge, config.slam)
         if mapped is None:
-            return Scanned(_loops(bag, recording, config, progress))
-        return Scanned(_fixes(bag, recording, mapped, config, progress))
+            loops = find_loop_closures(steps, config.lidar.loops).loops
+            return Scanned(ScanEvidence(loops=loops))
+        return Scanned(ScanEvidence(fixes=_fixes(steps, recording, mapped, config)))
     except LidarError as error:
         return Scanned(notes=(f"{bag}: its point clouds take no part: {error}",))
 
 
-def _loops(bag: Path, recording: Recording, config: Config, progress: Progress) -> ScanEvidence:
-    options, scans = config.lidar.loops, bag_scans(bag, config, progress)
-    edge = options.registration.edge
-    repaired = without_jumps(recording.trajectory, config.slam.jumps)
-    steps = scan_odometry(scans, repaired, edge, config.slam)
-    return ScanEvidence(loops=find_loop_closures(steps, options).loops)
-
-
 def _fixes(
-    bag: Path, recording: Recording, mapped: LidarMap, config: Config, progress: Progress
-) -> ScanEvidence:
-    options, scans = _localisation(config), bag_scans(bag, config, progress)
-    edge = options.registration.edge
-    repaired = without_jumps(recording.trajectory, config.slam.jumps)
-    steps = scan_odometry(scans, repaired, edge, config.slam)
+    steps: Iterator[ScanStep], recording: Recording, mapped: LidarMap, config: Config
+) -> tuple[PoseFix, ...]:
     first = next(steps, None)
     if first is None:
         raise LidarError("no scan has points enough, at a time that has odometry")
@@ -119,23 +110,11 @@ def _fixes(
         start = scan_start(first, cloud, mapped, config.lidar)
     else:
         known = start_pose(recording.trajectory, config.slam.start)
-        T_map_odom = _map_odom(recording, known.T_map_lidar)
+        T_map_odom = compose(known.T_map_lidar, recording.trajectory.pose(0).inverse())
         start = PoseEstimate(compose(T_map_odom, first.T_odom_lidar), known.covariance)
+    options = config.lidar.localisation.beside_odometry()
     found = localise_scans(chain([first], steps), cloud, start, options)
-    return ScanEvidence(fixes=spaced(found.fixes, config.slam.key_poses.distance_m, options))
-
-
-def _localisation(config: Config) -> ScanLocalisationOptions:
-    options = config.lidar.localisation
-    return options.model_copy(
-        update={"registration": options.registration.model_copy(update=UNSEEN)}
-    )
-
-
-def _map_odom(recording: Recording, T_map_lidar: RigidTransform) -> RigidTransform:
-    """Return where the frame of odometry lies in the map if its first pose is this."""
-    odometry = recording.trajectory
-    return compose(T_map_lidar, RigidTransform(odometry.R[0], odometry.p[0]).inverse())
+    return spaced(found.fixes, config.slam.key_poses.distance_m, options)
 
 
 TRAJECTORY_FILE = "trajectory.tum"
@@ -305,6 +284,12 @@ def _has_failed(calibration: CalibrationResult) -> bool:
     return judged is not None and judged.level is Level.FAIL
 
 
+def opened(saved: SavedMap, recording: Recording, config: Config, progress: Progress) -> FieldMap:
+    """Return the map that a drive is localised in."""
+    # A start that is given, or found, puts odometry of any frame into the map.
+    return saved.open(progress, [recording] if config.slam.start.by_odometry else [])
+
+
 def _localised(
     recording: Recording,
     calibration: CalibrationResult,
@@ -313,8 +298,7 @@ def _localised(
     config: Config,
     progress: Progress,
 ) -> _Found:
-    # A start that is given, or found, puts odometry of any frame into the map.
-    field_map = saved.open(progress, [recording] if config.slam.start.by_odometry else [])
+    field_map = opened(saved, recording, config, progress)
     found = localise(recording, field_map, calibration, config.slam, progress, evidence)
     if found.result.status in NOWHERE:
         reasons = "; ".join((found.result.message, *found.result.notes))

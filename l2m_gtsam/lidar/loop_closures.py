@@ -13,6 +13,7 @@ from l2m_gtsam.lidar.odometry import ScanStep
 from l2m_gtsam.lidar.registration import Refusal, RegistrationOptions, by_scan, register
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
+from l2m_gtsam.progress import completed
 from l2m_gtsam.records.scans import LoopClosure
 
 
@@ -104,7 +105,8 @@ def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopC
         here = KeyScan.of(step.stamp_ns, step.surface, step.T_odom_lidar, path)
         for k in candidates(kept, here, options):
             first = kept[k].surface()
-            closed = closed_loop(kept[k], here, first, step.surface, options.registration)
+            work = closing_loop(kept[k], here, first, step.surface, options.registration)
+            closed = completed(work)
             if isinstance(closed, LoopClosure):
                 loops.append(closed)
             else:
@@ -121,14 +123,12 @@ def candidates(kept: Sequence[KeyScan], here: KeyScan, options: LoopOptions) -> 
     return [old[k] for k in near if away[k] <= options.search_m]
 
 
-def closed_loop(
-    earlier: KeyScan,
-    here: KeyScan,
-    first: Surface,
-    scan: Surface,
-    options: RegistrationOptions,
-) -> LoopClosure | Refusal:
+def closing_loop(
+    earlier: KeyScan, here: KeyScan, first: Surface, scan: Surface, options: RegistrationOptions
+) -> Generator[None, None, LoopClosure | Refusal]:
     """Return the loop closure between two scans, or why there is none.
+
+    Yields between the registrations one way and the other.
 
     Parameters
     ----------
@@ -139,23 +139,6 @@ def closed_loop(
     options
         How they are registered.
     """
-    work = closing_loop(earlier, here, first, scan, options)
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            closed: LoopClosure | Refusal = end.value
-            return closed
-
-
-def closing_loop(
-    earlier: KeyScan,
-    here: KeyScan,
-    first: Surface,
-    scan: Surface,
-    options: RegistrationOptions,
-) -> Generator[None, None, LoopClosure | Refusal]:
-    """Return the same; yields between the registrations one way and the other."""
     guess = between(earlier.T, here.T)
     found = register(scan, first, guess, options)
     refusal = found.refusal(options)

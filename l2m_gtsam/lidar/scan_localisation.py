@@ -27,6 +27,9 @@ from l2m_gtsam.records.scans import PoseFix
 
 # Points of the scan that rank the candidates.
 FEW_POINTS = 400
+# Along what a scan does not show a fix says nothing, nor do some hundreds of them; more than this
+# beside the millimetres of what it shows would drown in rounding.
+UNSEEN = {"unseen_m": 100.0, "unseen_deg": 100.0}
 
 
 class ScanStartOptions(Options):
@@ -55,6 +58,11 @@ class ScanLocalisationOptions(Options):
     """and of the rotation in degrees."""
     cloud_over_m: float = Field(default=5.0, gt=0)
     """Path length over which the cloud's errors are the same."""
+
+    def beside_odometry(self) -> "ScanLocalisationOptions":
+        """Return options with which a fix says nothing along what its scan does not show."""
+        registration = self.registration.model_copy(update=UNSEEN)
+        return self.model_copy(update={"registration": registration})
 
     def of_cloud(self) -> FloatArray:
         """Return the covariance that the cloud's errors add to a pose, shape (6, 6)."""

@@ -298,9 +298,9 @@ class LocalisationResult:
     sensors: tuple[SensorUse, ...]
     calibration: CalibrationResult | None
     notes: tuple[str, ...]
-    bag: SourceFile | None
-    map: SourceFile | None
-    calibration_source: SourceFile | None
+    bag: SourceFile | None = None
+    map: SourceFile | None = None
+    calibration_source: SourceFile | None = None
     start: StartSearch | None = None
     explored: Explored | None = None
     scans: ScanUse | None = None

@@ -20,7 +20,7 @@ from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.slips import judged, with_open_jumps, with_recorded_jumps
 from l2m_gtsam.slam.solution import DriveSolution
-from l2m_gtsam.slam.unknown_field.kept_odometry import with_gain
+from l2m_gtsam.slam.unknown_field.gain import with_gain
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution
 from l2m_gtsam.slam.unknown_field.tiled_stages import map_drive

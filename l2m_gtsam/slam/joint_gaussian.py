@@ -14,12 +14,17 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from l2m_factors import D, T, X
 from l2m_gtsam.calibration.joint_information import columns_at, slices_of
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.online.belief import POSE
+from l2m_gtsam.slam.pose_graph import calibration_values
 from l2m_gtsam.solve.linear_algebra import correlation_factor, triangular_information_root
 
 ROUNDING = 1e-12  # of a correlation
 ROWS = 256  # of a covariance that are updated at once
+POSITION, DISTORTION = 3, 12  # components of a sensor's variables
 PIECE = 4e9  # multiplications: some 0.3 s
 
 
@@ -173,6 +178,19 @@ class JointGaussian:
         values = retracted(part_of(self.values, list(rest)), rest, found.shift)
         values.insert(kept.values)
         return JointGaussian(values, {**rest, **kept.sizes}, covariance)
+
+
+def of_key_pose(
+    number: int, pose: gtsam.Pose3, free: KnownSensors | None, covariance: FloatArray
+) -> JointGaussian:
+    """Return what is known of a key pose and, where calibrations are variables, of sensors."""
+    values, sizes = gtsam.Values(), {X(number): POSE}
+    values.insert(X(number), pose)
+    if free is not None:
+        values.insert(calibration_values(free))
+        for i in range(len(free.names)):
+            sizes |= {T(i): POSITION, D(i): DISTORTION}
+    return JointGaussian(values, sizes, covariance)
 
 
 def part_of(values: gtsam.Values, keys: Sequence[int]) -> gtsam.Values:

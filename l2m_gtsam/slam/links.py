@@ -11,6 +11,7 @@ from l2m_gtsam.data import (
     RigidTransform,
     RowTable,
     Trajectory,
+    joined_rows,
 )
 from l2m_gtsam.geometry import between, compose, moved
 from l2m_gtsam.lidar.registration import PoseEstimate
@@ -133,22 +134,8 @@ def key_pose_links(
         return Links.none()
     carrier = _Carrier(link_stamps(evidence), trajectory, rows, options)
     fixes = [carrier.fix(each) for each in evidence.fixes]
-    loops = [carrier.loop(each) for each in evidence.loops]
-    links = [each for each in (*fixes, *loops) if each.origin != each.key_pose]
-    return Links(
-        origin=np.array([each.origin for each in links], dtype=np.int64),
-        key_pose=np.array([each.key_pose for each in links], dtype=np.int64),
-        R=np.reshape([each.found.T.R for each in links], (-1, 3, 3)),
-        p=np.reshape([each.found.T.t for each in links], (-1, 3)),
-        covariance=np.reshape([each.found.covariance for each in links], (-1, 6, 6)),
-    )
-
-
-@dataclass(frozen=True)
-class _Link:
-    origin: int
-    key_pose: int
-    found: PoseEstimate
+    links = joined_rows([*fixes, *(carrier.loop(each) for each in evidence.loops)])
+    return links[links.origin != links.key_pose]
 
 
 class _Carrier:
@@ -162,27 +149,21 @@ class _Carrier:
         after = np.clip(np.searchsorted(keys, stamps), 1, len(keys) - 1)
         nearest = after - (stamps - keys[after - 1] < keys[after] - stamps)
         self._nearest = {
-            int(stamp): (int(k), _between(at, i, trajectory, int(rows[k])))
+            int(stamp): (int(k), between(at.pose(i), trajectory.pose(int(rows[k]))))
             for i, (stamp, k) in enumerate(zip(stamps, nearest, strict=True))
         }
 
-    def fix(self, fix: PoseFix) -> _Link:
+    def fix(self, fix: PoseFix) -> Links:
         """Return a key pose in the map."""
         k, T_scan_key = self._nearest[fix.stamp_ns]
         found = PoseEstimate(fix.T_map_lidar, fix.covariance)
-        return _Link(MAP, k, carried_on(found, T_scan_key, self._options))
+        return Links.single(MAP, k, carried_on(found, T_scan_key, self._options))
 
-    def loop(self, loop: LoopClosure) -> _Link:
+    def loop(self, loop: LoopClosure) -> Links:
         """Return a key pose in the frame of an earlier one."""
         origin, T_first_origin = self._nearest[loop.from_ns]
         k, T_second_key = self._nearest[loop.to_ns]
         found = PoseEstimate(loop.T_from_to, loop.covariance)
         of_key_pose = carried_on(found, T_second_key, self._options)
         there = seen_from_before(of_key_pose, T_first_origin.inverse(), self._options)
-        return _Link(origin, k, there)
-
-
-def _between(one: Trajectory, i: int, other: Trajectory, k: int) -> RigidTransform:
-    """Return a pose of the other trajectory in the frame of a pose of the first."""
-    first, second = (RigidTransform(each.R[n], each.p[n]) for each, n in ((one, i), (other, k)))
-    return between(first, second)
+        return Links.single(origin, k, there)

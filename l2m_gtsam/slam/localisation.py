@@ -24,11 +24,7 @@ from l2m_gtsam.slam.held_calibration import held_notes, with_calibration_use
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import key_pose_links, link_stamps
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
-from l2m_gtsam.slam.moved_sensors import (
-    calibration_changes,
-    sensor_to_leave_out,
-    without_series,
-)
+from l2m_gtsam.slam.moved_sensors import calibration_changes, sensor_to_leave_out, without_series
 from l2m_gtsam.slam.moving_fields import without_moving_fields
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes

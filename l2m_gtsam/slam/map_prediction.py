@@ -1,7 +1,7 @@
 """What the map predicts at the readings, at an estimate of poses and sensors."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -159,11 +159,5 @@ def sensors_in(values: gtsam.Values, known: KnownSensors) -> KnownSensors:
     count = range(len(known.names))
     if not values.exists(T(0)):
         return known
-    return KnownSensors(
-        known.names,
-        np.stack([values.atPoint3(T(i)) for i in count]),
-        np.stack([values.atVector(D(i)) for i in count]),
-        known.offset,
-        known.noise,
-        known.covariance,
-    )
+    t = np.stack([values.atPoint3(T(i)) for i in count])
+    return replace(known, t=t, distortion=np.stack([values.atVector(D(i)) for i in count]))

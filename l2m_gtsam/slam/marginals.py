@@ -8,7 +8,6 @@ from typing import Protocol, TypeVar
 
 import gtsam
 import numpy as np
-from scipy.linalg.lapack import dtrtri
 
 from l2m_factors import D, G, T, V, X
 from l2m_gtsam.calibration.joint_information import columns_at, slices_of
@@ -18,7 +17,7 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.localisation import OdometryScale, OdometryTurn
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.online.belief import POSE
-from l2m_gtsam.slam.selected_inverse import shared_covariances
+from l2m_gtsam.slam.selected_inverse import inverse_of, shared_covariances
 from l2m_gtsam.solve.linear_algebra import triangular_information_root
 
 Result = TypeVar("Result")
@@ -90,7 +89,8 @@ class Marginals:
             if covariance is not None:
                 return np.asarray(covariance)
         left = self._qr.joint(own, gtsam.EliminateQR)
-        return net_covariance(left.eliminateSequential(ordered(keys), gtsam.EliminateQR), keys)
+        net = left.eliminateSequential(gtsam.Ordering(own), gtsam.EliminateQR)
+        return net_covariance(net, keys)
 
     def sharing(self, groups: Sequence[Sequence[int]]) -> list[FloatArray]:
         """Return joint covariances of many groups of variables, each of which shares a factor.
@@ -133,7 +133,7 @@ class Marginals:
         if not without:
             return whole
         # The conditionals of what is eliminated first are its information where the rest is known.
-        first, _ = self._linear.eliminatePartialMultifrontal(ordered(without))
+        first, _ = self._linear.eliminatePartialMultifrontal(gtsam.Ordering(list(without)))
         return whole - float(first.logDeterminant())
 
     @cached_property
@@ -178,7 +178,7 @@ def joint_posterior(linear: gtsam.GaussianFactorGraph, keys: Sequence[int]) -> J
     left is dense. GTSAM decides whether Cholesky solves it, and LAPACK inverts it: 55 ms in all for
     270 components, where GTSAM's covariance of its tree takes 77.
     """
-    last = ordered(keys)
+    last = gtsam.Ordering(list(keys))
 
     def by_cholesky() -> tuple[FloatArray, FloatArray, float]:
         left = linear.marginal(list(keys))
@@ -199,14 +199,6 @@ def joint_posterior(linear: gtsam.GaussianFactorGraph, keys: Sequence[int]) -> J
     covariance, mean, least = unless_indeterminate(by_cholesky) or by_qr()
     here = linear.error(gtsam.VectorValues.Zero(linear.gradientAtZero()))
     return JointPosterior(covariance, mean, here - least)
-
-
-def ordered(keys: Sequence[int]) -> gtsam.Ordering:
-    """Return keys as an elimination order."""
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return ordering
 
 
 def unless_indeterminate(work: Callable[[], Result]) -> Result | None:
@@ -236,9 +228,7 @@ def covariance_of(root: FloatArray) -> FloatArray:
 
     GTSAM would invert ``R^T R`` by Cholesky, which squares the condition number again.
     """
-    half, singular = dtrtri(root)
-    if singular:
-        raise np.linalg.LinAlgError("no factor determines a variable")
+    half = inverse_of(root)
     return np.asarray(half @ half.T)
 
 

@@ -294,8 +294,7 @@ def scan_odometry(
         near = _around(repaired.trajectory, scan.stamp_ns)
         if len(scan) < LEAST_POINTS or not has_pose(near, at, options.max_pose_gap_s)[0]:
             continue
-        pose = interpolated(near, at)
-        here = RigidTransform(pose.R[0], pose.p[0])
+        here = interpolated(near, at).pose(0)
         step = IDENTITY if last is None else between(last, here)
         up = here.R[2][None]
         covariance = drift_covariance(step.R[None], step.t[None], options.drift, up)[0]

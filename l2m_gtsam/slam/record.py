@@ -20,12 +20,7 @@ from l2m_gtsam.qa.metrics.fit import curves, fit_figures, normalised_figures, se
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.qa.metrics.trajectory import ComparedTrajectories, truth_record
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
-from l2m_gtsam.records.localisation import (
-    LocalisationResult,
-    SensorUse,
-    StartFinding,
-    StartSearch,
-)
+from l2m_gtsam.records.localisation import LocalisationResult, SensorUse, StartFinding, StartSearch
 from l2m_gtsam.records.localisation_file import (
     LocalisationRecord,
     OdometryRecord,

@@ -85,11 +85,7 @@ class RelativeMotions:
         return np.asarray((s * (1 - s))[:, None, None] * (F @ Q @ F.transpose(0, 2, 1)))
 
     def whitening(
-        self,
-        rows: IntArray,
-        own: FloatArray,
-        by_lidar: FloatArray,
-        more: FloatArray | None = None,
+        self, rows: IntArray, own: FloatArray, by_lidar: FloatArray, more: FloatArray | None = None
     ) -> Whitening:
         """Return the joint whitening of the residuals of n readings on one key pose.
 

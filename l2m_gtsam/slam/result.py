@@ -60,6 +60,7 @@ def localisation_result(
     """
     alone = drive.as_recorded(drive.jumps).dead_reckoning()
     status, message = _verdict(solution, decoys)
+    sensors = replace(solution.drive.sensors, covariance=solution.calibration_covariance)
     steady = drive.without_drift(solution.steady, solution.poses)
     odometry = _trajectory(drive, alone)
     trajectory = replace(_trajectory(drive, solution.poses), covariance=solution.pose_covariance)
@@ -70,11 +71,8 @@ def localisation_result(
         odometry=odometry,
         drift=drift_figures(trajectory, odometry),
         sensors=tuple(_use(solution, i) for i in range(len(drive.sensors.names))),
-        calibration=None if refine is None else refined(refine, known_by(solution)),
+        calibration=None if refine is None else refined(refine, sensors),
         notes=slip_notes(steady, solution.poses, solution.scale_error),
-        bag=None,
-        map=None,
-        calibration_source=None,
         scans=scan_use(solution, by_scans),
         by_scans=_trajectory(drive, by_scans.poses) if len(by_scans.believed) else None,
         scale=solution.scale,
@@ -133,11 +131,6 @@ def drift_figures(localised: Trajectory, odometry: Trajectory) -> DriftFigures:
         largest_m=float(apart.max()),
         rms_m=float(np.sqrt(np.mean(apart**2))),
     )
-
-
-def known_by(solution: DriveSolution) -> KnownSensors:
-    """Return the sensors of a drive with the covariances that it left them."""
-    return replace(solution.drive.sensors, covariance=solution.calibration_covariance)
 
 
 def refined(calibration: CalibrationResult, sensors: KnownSensors) -> CalibrationResult:

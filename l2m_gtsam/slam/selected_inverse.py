@@ -169,9 +169,7 @@ def clique_covariance(
         white[rows, rows] = own.root
         white[rows, columns(clique.variables, own.separator, size)] = own.connected
         first = rows.stop
-    half, singular = dtrtri(white[:, :inner])
-    if singular:
-        raise np.linalg.LinAlgError("no factor determines a variable")
+    half = inverse_of(white[:, :inner])
     gain = half @ white[:, inner:]
     P = np.empty((inner + len(P_SS),) * 2)
     P[:inner, inner:] = -gain @ P_SS
@@ -180,6 +178,20 @@ def clique_covariance(
     # Both terms are squares: nothing cancels.
     P[:inner, :inner] = half @ half.T - P[:inner, inner:] @ gain.T
     return P
+
+
+def inverse_of(root: FloatArray) -> FloatArray:
+    """Return the inverse of an upper triangle.
+
+    Raises
+    ------
+    LinAlgError
+        It is singular.
+    """
+    half, singular = dtrtri(root)
+    if singular:
+        raise np.linalg.LinAlgError("no factor determines a variable")
+    return np.asarray(half)
 
 
 def columns(variables: Sequence[int], chosen: Sequence[int], size: IntArray) -> IntArray:

@@ -63,12 +63,8 @@ class SmoothingProblem:
 
     def __init__(self, drive: Drive, field_map: QueryableMap, options: SlamOptions) -> None:
         self._drive, self._map, self._options = drive, field_map, options
+        self._free = options.calibration is CalibrationUse.REFINED
         self._odometry, self._links = odometry_graph(drive), link_graph(drive.links)
-
-    @property
-    def free(self) -> bool:
-        """Whether calibrations are variables."""
-        return self._options.calibration is CalibrationUse.REFINED
 
     def sensors(self, values: gtsam.Values) -> KnownSensors:
         """Return the sensors with the calibrations in values."""
@@ -144,14 +140,14 @@ class SmoothingProblem:
         drive, graph = self._drive, gtsam.NonlinearFactorGraph()
         graph.push_back(self._odometry)
         graph.push_back(self._links)
-        if self.free:
+        if self._free:
             graph.push_back(calibration_graph(drive.sensors))
         rows = np.flatnonzero(weights > REJECTED_WEIGHT)
         if not len(rows):
             return graph
         W = predicted.prediction.whitening(drive.sensors.noise, map_variance)
         W = W * np.sqrt(weights)[:, None, None]
-        fixed = None if self.free else drive.sensors.fixed()
+        fixed = None if self._free else drive.sensors.fixed()
         batch = MapBatch(self._map, predicted.motions.readings[rows], fixed)
         for k in batch.key_poses:
             own = rows[batch.rows_of(k)]
@@ -207,8 +203,7 @@ def localise_drive(
     """Estimate the poses of a drive, and its calibrations if these are to be refined."""
     problem = SmoothingProblem(drive, field_map, options)
     followed = drive.as_walk(options.drift.over_m)
-    start, sensors, over_m = followed.start, followed.sensors, options.drift.over_m
-    follower = Follower(start, sensors, field_map, options.robust, over_m, free=problem.free)
+    follower = Follower(drive.start, drive.sensors, field_map, options)
     values = follow(follower, followed, progress)
     values.insert(shared_values(drive))
     counts = np.ones(len(drive.readings), dtype=np.bool_)

@@ -66,12 +66,12 @@ class DriveSolution:
     weights: FloatArray
     near_changes: BoolArray
     odometry_chi2: float
-    scale: OdometryScale | None
-    turn: OdometryTurn | None
-    steady: FloatArray | None
     link_squared: FloatArray
     ending: Ending
     step_covariance: FloatArray
+    scale: OdometryScale | None = None
+    turn: OdometryTurn | None = None
+    steady: FloatArray | None = None
 
     @property
     def scale_error(self) -> float:

@@ -15,7 +15,7 @@ from l2m_gtsam.data import (
     SourceFile,
     Trajectory,
 )
-from tests.worlds.exact import DipoleWorld, dipole_world
+from tests.worlds.exact import DipoleWorld, dipole_world, exact_reading
 
 NOISE = 0.2
 COUNT = 300
@@ -116,9 +116,8 @@ def recorded(trajectory: Trajectory, world: World, places: FloatArray = PLACES) 
     rng = np.random.default_rng(7)
     series = []
     for sensor in mounted(places):
-        x = trajectory.R @ sensor.t_lidar_mag + trajectory.p
-        b = np.einsum("nji,nj->ni", trajectory.R, world.field_and_gradient(x)[0])
-        field = sensor.distortion.apply(b) + rng.normal(0, NOISE, b.shape)
+        read = exact_reading(world, sensor, trajectory.R, trajectory.p)
+        field = read + rng.normal(0, NOISE, read.shape)
         series.append(FieldSeries(sensor.sensor, "/m", "m", trajectory.stamp_ns, field))
     return Recording(trajectory, tuple(series), SourceFile("drive.bag", "ab12"))
 

@@ -11,7 +11,7 @@ from l2m_gtsam.data import FloatArray, KnownSensor, RigidTransform, Trajectory
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_poses
 from l2m_gtsam.slam.odometry import odometry_steps
 from l2m_gtsam.slam.options import DriftOptions
-from tests.drives.slam import Field
+from tests.worlds.exact import Field
 
 START = np.repeat([np.deg2rad(2.0), 0.1], 3)  # sigmas of the first pose, rad and m
 DRIFT = DriftOptions(steady=0.0)  # none is drawn

@@ -36,11 +36,7 @@ class OnLine:
 
     @classmethod
     def over(
-        cls,
-        drive: Drive,
-        truth: list[gtsam.Pose3],
-        options: SlamOptions,
-        pace: ExploringOptions,
+        cls, drive: Drive, truth: list[gtsam.Pose3], options: SlamOptions, pace: ExploringOptions
     ) -> "OnLine":
         """Follow a drive."""
         drive = drive.as_walk(options.drift.over_m)

@@ -5,7 +5,7 @@ from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.follower import SECTION, Follower
 from l2m_gtsam.slam.online.key_pose import key_poses_of
-from l2m_gtsam.slam.options import DriftOptions
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.solve.robust import RobustOptions
 
 
@@ -18,7 +18,8 @@ def followed_beliefs(
     section: int = SECTION,
 ) -> list[Belief]:
     """Return what was known of each key pose when it came, of the last when all was solved."""
-    start, sensors, over_m = drive.start, drive.sensors, DriftOptions().over_m
-    follower = Follower(start, sensors, field_map, robust, over_m, free=free, section=section)
+    use = CalibrationUse.REFINED if free else CalibrationUse.FIXED
+    options = SlamOptions(robust=robust, calibration=use)
+    follower = Follower(drive.start, drive.sensors, field_map, options, section)
     beliefs = [follower.add(each) for each in key_poses_of(drive)]
     return [*beliefs[:-1], follower.finish()]

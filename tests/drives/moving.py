@@ -18,6 +18,7 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.records.calibration import Uncertainty
 from tests.drives.uncertain import NOISE, WORLD, small_sensors
+from tests.worlds.exact import exact_reading
 
 STEP_NS, START_NS = 50_000_000, 1_700_000_000_000_000_000
 
@@ -124,7 +125,6 @@ def _trajectory(rng: np.random.Generator, s: FloatArray) -> Trajectory:
 def _series(
     rng: np.random.Generator, path: Trajectory, sensor: KnownSensor, more: FloatArray
 ) -> FieldSeries:
-    B, _ = WORLD.field_and_gradient(path.R @ sensor.t_lidar_mag + path.p)
-    field = sensor.distortion.apply(np.einsum("nji,nj->ni", path.R, B)) + more
+    field = exact_reading(WORLD, sensor, path.R, path.p) + more
     field += NOISE * rng.normal(size=field.shape)
     return FieldSeries(sensor.sensor, "/" + sensor.sensor, "mag", path.stamp_ns, field)

@@ -33,10 +33,7 @@ class Shelf:
 
 
 def with_shelves(
-    recording: Recording,
-    shelves: tuple[Shelf, ...],
-    places: FloatArray,
-    known: CalibrationResult,
+    recording: Recording, shelves: tuple[Shelf, ...], places: FloatArray, known: CalibrationResult
 ) -> Recording:
     """Return a recording whose sensors read shelves, too.
 

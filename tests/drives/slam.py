@@ -1,7 +1,6 @@
 """Drives whose odometry drifts, through fields that are known."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -19,18 +18,12 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.options import KeyPoseOptions
 from l2m_gtsam.studies.slam_array.odometry import slipping
 from tests.drives.calibrations import calibration, sensor
-from tests.worlds.exact import dipole_world, random_sensors
+from tests.worlds.exact import Field, dipole_world, exact_reading, random_sensors
 
 RATE_HZ = 20
 SPEED = 0.6  # m/s
 WIDE = np.concatenate([np.full(3, 0.05), np.full(9, 0.05), np.full(3, 10.0)])
 COARSE = KeyPoseOptions(readings=3)  # enough, and quick
-
-
-class Field(Protocol):
-    """A field that is known everywhere."""
-
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]: ...
 
 
 @dataclass(frozen=True)
@@ -90,8 +83,7 @@ def slam_drive(
     p = np.column_stack([np.interp(at, seconds, axis) for axis in truth.p.T])
     series = []
     for each in sensors:
-        B, _ = world.field_and_gradient(R @ each.t_lidar_mag + p)
-        read = each.distortion.apply(np.einsum("nji,nj->ni", R, B))
+        read = exact_reading(world, each, R, p)
         read = read + noise * rng.normal(size=read.shape)
         series.append(FieldSeries(each.sensor, f"/{each.sensor}", each.sensor, stamps, read))
     source = SourceFile("simulated", "00")

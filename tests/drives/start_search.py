@@ -3,8 +3,8 @@
 import numpy as np
 
 from l2m_gtsam.calibration.start.global_start import StartOptions
-from l2m_gtsam.data import Readings
-from tests.worlds.exact import DipoleWorld, dipole_world, drive, random_sensors
+from l2m_gtsam.data import Readings, Trajectory
+from tests.worlds.exact import DipoleWorld, dipole_world, drive, random_sensors, read_together
 
 # The exact field of these worlds is slow to compute: fewer poses, fewer dipoles.
 OPTIONS = StartOptions(poses=60)
@@ -17,22 +17,8 @@ WORLD = dipole_world(4, count=12)
 def together(seed: int = 4, noise: float = 0.2, world: DipoleWorld = WORLD) -> Readings:
     """Return what three sensors of one vehicle read, each at poses that all of them share."""
     one = drive(seed, SENSORS[:1], world, count=400)
-    rng = np.random.default_rng(seed)
-    parts = []
-    for sensor in SENSORS:
-        places = one.R_map_lidar @ sensor.t_lidar_mag + one.p_map_lidar
-        b_map, _ = world.field_and_gradient(places)
-        b = np.einsum("kji,kj->ki", one.R_map_lidar, b_map)
-        parts.append(sensor.distortion.apply(b) + rng.normal(0, noise, b.shape))
-    n, count = len(one), len(SENSORS)
-    return Readings(
-        tuple(sensor.sensor for sensor in SENSORS),
-        np.repeat(np.arange(count), n),
-        np.tile(one.stamp_ns, count),
-        np.tile(one.R_map_lidar, (count, 1, 1)),
-        np.tile(one.p_map_lidar, (count, 1)),
-        np.concatenate(parts),
-    )
+    poses = Trajectory(one.stamp_ns, one.R_map_lidar, one.p_map_lidar, "map", "lidar")
+    return read_together(SENSORS, world, poses, np.random.default_rng(seed), noise)
 
 
 PERIOD = 2.0  # metres

@@ -16,7 +16,7 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from tests.drives.degenerate import POSTS, STRONG, World, eight, mounted, straight
-from tests.worlds.exact import dipole_world
+from tests.worlds.exact import dipole_world, exact_reading
 
 NOISE = 0.1
 PLACES = np.array([[0.2, -0.1, 0.15], [-0.3, 0.25, 0.1], [0.1, 0.3, -0.1]])
@@ -51,9 +51,8 @@ def read(
     sensor: KnownSensor, trajectory: Trajectory, place: World, rng: np.random.Generator
 ) -> FieldSeries:
     """Return what a sensor reads along a drive, with noise."""
-    x = trajectory.R @ sensor.t_lidar_mag + trajectory.p
-    b = np.einsum("nji,nj->ni", trajectory.R, place.field_and_gradient(x)[0])
-    field = sensor.distortion.apply(b) + rng.normal(0, NOISE, b.shape)
+    field = exact_reading(place, sensor, trajectory.R, trajectory.p)
+    field = field + rng.normal(0, NOISE, field.shape)
     return FieldSeries(sensor.sensor, "/m", "m", trajectory.stamp_ns, field)
 
 

@@ -13,7 +13,6 @@ from l2m_gtsam.slam.joint_gaussian import (
     poses_among,
     retracted,
 )
-from l2m_gtsam.slam.marginals import ordered
 
 STEPS = 30
 
@@ -31,7 +30,7 @@ def newton(
     own, prior = columns_at(at, among), columns_at(at, known.sizes)
     for _ in range(steps):
         H, descent = np.zeros((count, count)), np.zeros(count)
-        H[np.ix_(own, own)], descent[own] = graph.linearize(values).hessian(ordered(among))
+        H[np.ix_(own, own)], descent[own] = graph.linearize(values).hessian(gtsam.Ordering(among))
         information, gradient = _quadratic(known, values)
         H[np.ix_(prior, prior)] += information
         descent[prior] -= gradient

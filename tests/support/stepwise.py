@@ -3,16 +3,13 @@
 from collections.abc import Generator
 from typing import TypeVar
 
+from l2m_gtsam import progress
+
 Found = TypeVar("Found")
 
 
 def completed(work: Generator[None, None, Found]) -> tuple[Found, int]:
     """Return what work finds, and how often it paused."""
-    pauses = 0
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            found: Found = end.value
-            return found, pauses
-        pauses += 1
+    pauses: list[None] = []
+    found = progress.completed(work, pauses.append)
+    return found, len(pauses)

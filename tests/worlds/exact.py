@@ -1,14 +1,21 @@
 """Fields with closed forms and random drives through them, for tests that need an exact map."""
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numba import njit
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import Distortion, FieldSample, FloatArray, KnownSensor, Readings
+from l2m_gtsam.data import Distortion, FieldSample, FloatArray, KnownSensor, Readings, Trajectory
 
 DIPOLE_CONSTANT = 0.1  # mu_0 / 4 pi in uT m / A: B of a dipole of 1 A m^2 at 1 m is 0.1-0.2 uT
+
+
+class Field(Protocol):
+    """A field that is known everywhere."""
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]: ...
 
 
 @njit(cache=True)
@@ -106,6 +113,32 @@ def random_sensors(seed: int, count: int) -> tuple[KnownSensor, ...]:
         t = rng.uniform(-0.6, 0.6, 3)
         sensors.append(KnownSensor(f"mag_{index:02d}", t, Distortion(C, rng.normal(0, 15, 3))))
     return tuple(sensors)
+
+
+def exact_reading(world: Field, sensor: KnownSensor, R: FloatArray, p: FloatArray) -> FloatArray:
+    """Return what a sensor reads at poses of the lidar, uT, shape (N, 3)."""
+    B, _ = world.field_and_gradient(R @ sensor.t_lidar_mag + p)
+    return sensor.distortion.apply(np.einsum("nji,nj->ni", R, B))
+
+
+def read_together(
+    sensors: tuple[KnownSensor, ...],
+    world: Field,
+    at: Trajectory,
+    rng: np.random.Generator,
+    noise: float,
+) -> Readings:
+    """Return what sensors of one vehicle read with noise, at poses that all of them share."""
+    exact = [exact_reading(world, sensor, at.R, at.p) for sensor in sensors]
+    n, count = len(sensors), len(at)
+    return Readings(
+        tuple(sensor.sensor for sensor in sensors),
+        np.repeat(np.arange(n), count),
+        np.tile(at.stamp_ns, n),
+        np.tile(at.R, (n, 1, 1)),
+        np.tile(at.p, (n, 1)),
+        np.concatenate([each + rng.normal(0, noise, each.shape) for each in exact]),
+    )
 
 
 def drive(

@@ -22,7 +22,7 @@ from l2m_factors import D, KeyPoseReadings, MapBatch, StepError, T, Whitening, X
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose, as_transform
-from l2m_gtsam.slam.joint_gaussian import JointGaussian, prior_factors
+from l2m_gtsam.slam.joint_gaussian import of_key_pose, prior_factors
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.map_prediction import sensors_in
@@ -39,6 +39,7 @@ from l2m_gtsam.slam.online.measurements import (
 )
 from l2m_gtsam.slam.online.section import Section
 from l2m_gtsam.slam.online.tracked_drift import TrackedDrift
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
     between_factor,
     calibration_graph,
@@ -47,9 +48,7 @@ from l2m_gtsam.slam.pose_graph import (
     link_pose,
     start_factor,
 )
-from l2m_gtsam.solve.robust import RobustOptions
 
-POSITION, DISTORTION = 3, 12  # components of a sensor's variables
 AXES = 3
 SECTION = 200  # key poses that are solved together
 GROUP = 10  # key poses that are added to iSAM2 together,
@@ -113,14 +112,16 @@ class Follower:
         Calibrations.
     field_map
         Map that is queried for field and variance.
-    robust
-        Loss and confidence of the gate.
-    over_m
-        The distance over which what is left of a steady drift of odometry counts as a random walk.
-    free
-        Whether calibrations are variables.
+    options
+        Loss and confidence of the gate; calibrations are variables if they are ``refined``. Over
+        ``drift.over_m`` what is left of a steady drift of odometry counts as a random walk.
     section
         Key poses that are solved together.
+
+    Attributes
+    ----------
+    belief
+        The posterior of the last key pose.
     """
 
     def __init__(
@@ -128,15 +129,13 @@ class Follower:
         start: StartPose,
         sensors: KnownSensors,
         field_map: QueryableMap,
-        robust: RobustOptions,
-        over_m: float,
-        *,
-        free: bool,
+        options: SlamOptions,
         section: int = SECTION,
     ) -> None:
-        self._sensors, self._map, self._robust, self._free = sensors, field_map, robust, free
+        self._sensors, self._map, self._options = sensors, field_map, options
+        self._robust, self._free = options.robust, options.calibration is CalibrationUse.REFINED
         self._variance = CachedVariance(field_map)
-        numbers = range(len(sensors.names) if free else 0)
+        numbers = range(len(sensors.names) if self._free else 0)
         self._calibrations = [key for i in numbers for key in (T(i), D(i))]
         self._length, self._first, self._last = section, 0, -1
         self._past = gtsam.Values()
@@ -144,60 +143,40 @@ class Follower:
         self.fixes_refused = 0
         self.log_likelihood = 0.0  # of readings and scans so far, each against being an outlier
         self._section = Section(self._calibrations)
-        self._belief, self._pending = self._prior(start), self._opening(start)
-        self._drift = TrackedDrift.at_start(over_m, self._belief)
+        self.belief, self._pending = self._prior(start), self._opening(start)
+        self._drift = TrackedDrift.at_start(options.drift.over_m, self.belief)
 
     @classmethod
     def resumed(
-        cls,
-        last: "LastBelief",
-        field_map: QueryableMap,
-        robust: RobustOptions,
-        over_m: float,
-        *,
-        free: bool,
+        cls, last: "LastBelief", field_map: QueryableMap, options: SlamOptions
     ) -> "Follower":
         """Return a follower that goes on from what was known of a key pose."""
         belief, number = last.belief, last.number
-        pose = belief.pose
-        T_map_lidar = as_transform(pose)
-        start = StartPose(T_map_lidar, belief.pose_covariance)
-        own = cls(start, belief.sensors, field_map, robust, over_m, free=free)
-        values, sizes = gtsam.Values(), {X(number): POSE}
-        values.insert(X(number), pose)
-        if free:
-            values.insert(calibration_values(belief.sensors))
-            for i in range(len(belief.sensors.names)):
-                sizes |= {T(i): POSITION, D(i): DISTORTION}
-        prior = prior_factors(JointGaussian(values, sizes, belief.covariance))
-        own._belief, own._pending, own._drift = belief, PendingKeyPoses(), last.drift
+        start = StartPose(as_transform(belief.pose), belief.pose_covariance)
+        own = cls(start, belief.sensors, field_map, options)
+        sensors = belief.sensors if own._free else None
+        known = of_key_pose(number, belief.pose, sensors, belief.covariance)
+        own.belief, own._pending, own._drift = belief, PendingKeyPoses(), last.drift
         own._first = own._last = number
-        own._section.add(prior, values, number, 0)
+        own._section.add(prior_factors(known), known.values, number, 0)
         return own
 
     def forked(self) -> "Follower":
         """Return another follower that goes on from the last key pose."""
         self.finish()
-        own = Follower.resumed(
-            self.last, self._map, self._robust, self._drift.over_m, free=self._free
-        )
+        own = Follower.resumed(self.last, self._map, self._options)
         own.seen, own.used, own.fixes_refused = self.seen, self.used, self.fixes_refused
         own.log_likelihood = self.log_likelihood
         return own
 
     @property
-    def belief(self) -> Belief:
-        """The posterior of the last key pose."""
-        return self._belief
-
-    @property
     def last(self) -> "LastBelief":
         """What is known of the last key pose, from which another follower can go on."""
-        return LastBelief(self._last, self._belief, self._drift)
+        return LastBelief(self._last, self.belief, self._drift)
 
     def expected(self, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
         """Return the next key pose without what is known of odometry's steady drift."""
-        return self._drift.without(key_pose, self._belief)
+        return self._drift.without(key_pose, self.belief)
 
     def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior.
@@ -211,22 +190,22 @@ class Follower:
         if number > 0:
             self._advance(key_pose)
         is_fixed = self._update_by_fixes(key_pose.links)
-        self._pending.values.insert(X(number), self._belief.pose)
+        self._pending.values.insert(X(number), self.belief.pose)
         self._last = number
         # Not before there was a reading: iSAM2 needs the filter's estimate of calibrations far off.
         if 0 < number < EARLY or (number + 1) % GROUP == 0:
             self._update_section()
         if key_pose.lost or key_pose.recorded is not None:
-            self._drift = self._drift.anchored(self._belief)
+            self._drift = self._drift.anchored(self.belief)
         elif is_fixed or self.used > used:
-            self._drift = self._drift.seen(self._belief)
-        return self._belief
+            self._drift = self._drift.seen(self.belief)
+        return self.belief
 
     def finish(self) -> Belief:
         """Solve for the key poses that the filter alone has had so far."""
         if self._pending.values.size():
             self._update_section()
-        return self._belief
+        return self.belief
 
     def release(self) -> gtsam.Values:
         """Return the key poses of sections that are closed, and forget them."""
@@ -257,14 +236,14 @@ class Follower:
         most, passed = self._robust.largest_of(POSE), False
         for row in np.flatnonzero(links.in_map).tolist():
             own = links.covariance[row]
-            covariance = self._belief.pose_covariance + own
-            off = gtsam.Pose3.Logmap(link_pose(links, row).between(self._belief.pose))
+            covariance = self.belief.pose_covariance + own
+            off = gtsam.Pose3.Logmap(link_pose(links, row).between(self.belief.pose))
             squared = off @ np.linalg.solve(covariance, off)
             if squared > most:
                 self.fixes_refused += 1
             else:
                 measure = partial(fix_measurement, link_pose(links, row), own)
-                self._belief, passed = self._belief.updated(measure), True
+                self.belief, passed = self.belief.updated(measure), True
                 volume = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(own)[1]
                 self.log_likelihood += 0.5 * (most - squared - volume)
                 self._pending.graph.add(link_factor(links, row))
@@ -273,11 +252,11 @@ class Follower:
     def _advance(self, key_pose: ArrivedKeyPose) -> None:
         """Predict a key pose from the one before, and update by the readings between them."""
         expected, before = self.expected(key_pose), key_pose.number - 1
-        self._drift = self._drift.moved(key_pose, self._belief)
+        self._drift = self._drift.moved(key_pose, self.belief)
         # Readings are placed by odometry's own step.
         of_step = StepReadings(key_pose.readings, key_pose.step, expected.covariance)
-        belief = self._belief.predicted(expected.step, expected.covariance)
-        self._belief = self._update_by_readings(of_step, before, belief).marginalize_previous()
+        belief = self.belief.predicted(expected.step, expected.covariance)
+        self.belief = self._update_by_readings(of_step, before, belief).marginalize_previous()
         self._pending.graph.add(between_factor(before, expected.step, expected.covariance))
 
     def _update_by_readings(
@@ -309,13 +288,13 @@ class Follower:
             pending.graph.add(factor)
         if self._free and pending.values.exists(X(0)):
             # From the filter's estimate: linearised far off, readings would lead astray.
-            pending.values.insert(calibration_values(self._belief.sensors))
+            pending.values.insert(calibration_values(self.belief.sensors))
         sensors, section, last = self._sensors, self._section, self._last
         with reported_ill_conditioning():
             section.add(pending.graph, pending.values, last, AGAIN)
             if self._free:
                 sensors = sensors_in(section.calibration(), sensors)
-            self._belief = Belief(section.pose(last), sensors, section.covariance(last))
+            self.belief = Belief(section.pose(last), sensors, section.covariance(last))
             if last - self._first >= self._length:
                 self._hand_over(last)
 

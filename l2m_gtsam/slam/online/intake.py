@@ -225,14 +225,14 @@ class Intake:
         """Report a step over a gap, or one that the motion before does not explain."""
         state = self.state
         found = suspect_step(before, pose, state.velocity, self._options)
-        if self._options.drift.axes is StepAxes.FIXED and found is not None and not found.is_gap:
-            found = None  # a step that went on with the motion before would shift all that follow
-        step = velocity(before, pose)
-        # A turn that goes on looks like a jump once: its next step is like the one before it.
-        again = found is not None and found.kind is EventKind.ODOMETRY_JUMP
-        if again and suspect_step(before, pose, state.last_velocity, self._options) is None:
-            found = None if np.isfinite(state.last_velocity).all() else found
-        state.last_velocity = step
+        if found is not None and found.kind is EventKind.ODOMETRY_JUMP:
+            last = state.last_velocity
+            if self._options.drift.axes is StepAxes.FIXED:
+                found = None  # one that went on with the motion before would shift all that follow
+            # A turn that goes on looks like a jump once: its next step is like the one before it.
+            elif np.isfinite(last).all() and not suspect_step(before, pose, last, self._options):
+                found = None
+        step = state.last_velocity = velocity(before, pose)
         if found is None:
             state.velocity = step
             return
@@ -246,10 +246,8 @@ class Intake:
         poses, state = self.state.poses, self.state
         if not poses:
             return None
-        if state.number == 0:
-            return (
-                0 if at_end or len(poses) > 1 else None
-            )  # the next may say that its stamp is wrong
+        if state.number == 0:  # the next pose may say that the stamp of the first is wrong
+            return 0 if at_end or len(poses) > 1 else None
         delay = 0 if at_end else round(self._online.delay_s / NS)
         for row in range(self._looked_at, len(poses)):
             if self._is_key_pose(row):
@@ -353,8 +351,8 @@ def scans_at(scans: Sequence[Scan], trajectory: Trajectory, row: int) -> tuple[S
     """Return scans as if taken at once, with their poses relative to that of a row."""
     stamps = np.array([each.stamp_ns for each in scans], dtype=np.int64)
     at, motion = interpolated(trajectory, stamps), twists(trajectory, stamps)
-    key = RigidTransform(trajectory.R[row], trajectory.p[row])
+    key = trajectory.pose(row)
     return tuple(
-        ScanAtKeyPose(taken_at_once(scan, twist), between(key, RigidTransform(at.R[k], at.p[k])))
+        ScanAtKeyPose(taken_at_once(scan, twist), between(key, at.pose(k)))
         for k, (scan, twist) in enumerate(zip(scans, motion, strict=True))
     )

@@ -17,9 +17,9 @@ from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
 from l2m_gtsam.slam.key_pose_readings import joined_readings, no_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import FixedStep, OdometrySteps
+from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.slips import SLIPPED
 
-POSE = 6
 WRONG = float(1 / (1 + np.exp(SLIPPED)))  # how probable a wrong step over a gap is before readings
 
 

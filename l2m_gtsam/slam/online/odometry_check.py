@@ -51,11 +51,6 @@ class SuspectStep:
     lost: bool = False
     doubtful: bool = False
 
-    @property
-    def is_gap(self) -> bool:
-        """Whether odometry was silent."""
-        return self.kind is EventKind.ODOMETRY_GAP
-
 
 def velocity(before: OdometryPose, after: OdometryPose) -> FloatArray:
     """Return the velocity from one pose to another, rad/s and m/s along the vehicle's axes."""

@@ -80,5 +80,4 @@ def trajectory_of(poses: list[OdometryPose]) -> Trajectory:
 def pose_of(trajectory: Trajectory, row: int) -> OdometryPose:
     """Return a pose of a recorded odometry."""
     covariance = None if trajectory.covariance is None else trajectory.covariance[row]
-    T = RigidTransform(trajectory.R[row], trajectory.p[row])
-    return OdometryPose(int(trajectory.stamp_ns[row]), T, covariance)
+    return OdometryPose(int(trajectory.stamp_ns[row]), trajectory.pose(row), covariance)

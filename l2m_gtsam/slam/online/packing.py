@@ -29,7 +29,6 @@ from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
 
 Arrays = dict[str, npt.NDArray[Any]]
-LINKS = ("origin", "key_pose", "R", "p", "covariance")
 WAY = ("p", "p_covariance", "shift", "random", "drift_m")
 READINGS = ("key_pose", "sensor", "R_key_lidar", "p_key_lidar", "fraction", "field")
 STATE = ("weights", "distortion", "steady", "covariance")
@@ -79,7 +78,7 @@ def packed_key_poses(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
         ),
         "links": np.array([len(each.links) for each in key_poses], dtype=np.int64),
         **named("reading", {name: getattr(readings, name) for name in READINGS}),
-        **named("link", {name: getattr(links, name) for name in LINKS}),
+        **named("link", vars(links)),
         **named("fixed", _packed_fixed(key_poses)),
     }
 
@@ -99,8 +98,7 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
     columns = under("reading", arrays)
     key, sensor, R, p, fraction, field = (columns[name] for name in READINGS)
     readings = KeyPoseReadings(key, sensor, R, p, fraction, field)
-    of_links = under("link", arrays)
-    links = Links(*(of_links[name] for name in LINKS))
+    links = Links(**under("link", arrays))
     fixed = under("fixed", arrays)
     turning = arrays.get("turning", np.zeros((len(arrays["number"]), 3)))  # older states have none
     found, reading, link = [], 0, 0

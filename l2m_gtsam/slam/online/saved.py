@@ -50,7 +50,7 @@ from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.online.start_search import StartSearchState
 from l2m_gtsam.slam.online.tracked_drift import TrackedDrift
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExplorerState, MarginalizedPose
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
@@ -245,17 +245,11 @@ def _resume_following(slam: OnlineSlam, arrays: Arrays) -> None:
 def _unpacked_branch(slam: OnlineSlam, arrays: Arrays) -> Branch:
     sensors = replace(slam.sensors, t=arrays["t"], distortion=arrays["distortion"])
     belief = Belief(unpacked_poses(arrays)[0], sensors, arrays["covariance"])
-    options = slam.options
-    over_m, own = options.drift.over_m, under("drift", arrays)
+    over_m, own = slam.options.drift.over_m, under("drift", arrays)
     # Older states have none: it is found again.
     drift = unpacked_drift(own, over_m) if own else TrackedDrift.at_start(over_m, belief)
-    follower = Follower.resumed(
-        LastBelief(int(arrays["number"][0]), belief, drift),
-        slam.known_map(),
-        options.robust,
-        over_m,
-        free=options.calibration is CalibrationUse.REFINED,
-    )
+    last = LastBelief(int(arrays["number"][0]), belief, drift)
+    follower = Follower.resumed(last, slam.known_map(), slam.options)
     if "recorded" not in arrays:
         return Branch(follower)
     follower.log_likelihood = float(arrays["log_likelihood"][0])

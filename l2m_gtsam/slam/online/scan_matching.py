@@ -24,8 +24,6 @@ from l2m_gtsam.slam.options import DriftOptions
 
 CONTRADICTS = "a loop of scans is left out: it contradicts odometry and readings"
 PIECE_M = 0.05  # of path, in which a surface is made or two scans are registered one way
-# Along what a scan does not show a fix says nothing; more than this would drown in rounding.
-UNSEEN = {"unseen_m": 100.0, "unseen_deg": 100.0}
 
 
 @dataclass(frozen=True)
@@ -45,18 +43,15 @@ class ScanMatcher:
         In the map frame.
     options
         How, and when a scan is refused.
-    edge
-        Cell size in metres; scans are thinned to one point per cell.
     drift
         Of odometry, from the scan to its key pose.
     """
 
     def __init__(
-        self, cloud: Surface, options: ScanLocalisationOptions, edge: float, drift: DriftOptions
+        self, cloud: Surface, options: ScanLocalisationOptions, drift: DriftOptions
     ) -> None:
-        registration = options.registration.model_copy(update=UNSEEN)
-        self._cloud, self._edge, self._drift = cloud, edge, drift
-        self._options = options.model_copy(update={"registration": registration})
+        self._cloud, self._drift = cloud, drift
+        self._options = options.beside_odometry()
         self._path_m = np.inf  # since the last fix
 
     def fixes(
@@ -82,8 +77,8 @@ class ScanMatcher:
                 refused.append("a scan has too few points")
                 continue
             guess = compose(expected.T, each.T_key_scan)
-            surface = Surface(each.points, self._edge)
             registration = self._options.registration
+            surface = Surface(each.points, registration.edge)
             seen = register(surface, self._cloud, guess, registration)
             if (refusal := seen.refusal(registration)) is not None:
                 refused.append(f"a scan is left out: {refusal.value}")
@@ -166,28 +161,21 @@ class LoopMatcher:
     ----------
     options
         Which scans are kept and compared, and which loops are believed.
-    edge
-        Cell size in metres; scans are thinned to one point per cell.
     drift
         Of odometry, from a scan to its key pose.
     largest
         Squared distance of a loop from where it is expected, in sigmas, that passes for noise.
     """
 
-    def __init__(
-        self, options: LoopOptions, edge: float, drift: DriftOptions, largest: float
-    ) -> None:
-        self._options, self._edge, self._drift, self._largest = options, edge, drift, largest
+    def __init__(self, options: LoopOptions, drift: DriftOptions, largest: float) -> None:
+        self._options, self._drift, self._largest = options, drift, largest
         self.kept: list[KeptScan] = []
         self.path_m, self.last_m = 0.0, -np.inf  # so far, and at the last scan that was compared
         self._behind: ScanBehind | None = None
         self._work: Iterator[Links | str | None] = iter(())  # what is left of comparing it
 
     def loops(
-        self,
-        key_pose: ArrivedKeyPose,
-        expected: PoseEstimate,
-        known: Callable[[int], PoseEstimate],
+        self, key_pose: ArrivedKeyPose, expected: PoseEstimate, known: Callable[[int], PoseEstimate]
     ) -> ScanLinks:
         """Return the loops of a key pose that are found by now, and keep a scan of a new place.
 
@@ -248,7 +236,7 @@ class LoopMatcher:
         """Yield loops of a scan, or why they are left out; None after other pieces of the work."""
         own, options = behind.key_pose, self._options
         T = compose(behind.expected.T, at.T_key_scan)
-        surface = Surface(at.points, self._edge)
+        surface = Surface(at.points, options.registration.edge)
         here = KeyScan.of(stamp_ns, surface, T, self.path_m)
         scans = [each.seen_from(known(each.key_pose).T) for each in self.kept]
         contradicts = False

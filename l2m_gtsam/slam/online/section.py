@@ -5,7 +5,7 @@ import numpy as np
 
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.marginals import net_covariance, ordered, unless_indeterminate
+from l2m_gtsam.slam.marginals import net_covariance, unless_indeterminate
 from l2m_gtsam.slam.online.belief import POSE
 
 # Steps after which a variable is relinearised: rad and m, as a field is curved within decimetres;
@@ -101,7 +101,7 @@ class Section:
             )
         if covariance is None:
             left = engine.joint(keys, gtsam.EliminateQR)
-            net = left.eliminateSequential(ordered(keys), gtsam.EliminateQR)
+            net = left.eliminateSequential(gtsam.Ordering(keys), gtsam.EliminateQR)
             covariance = net_covariance(net, keys)
         return np.roll(covariance, POSE, axis=(0, 1))
 

@@ -37,7 +37,7 @@ from l2m_gtsam.slam.online.online_pose import OnlinePose
 from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanLinks, ScanMatcher
 from l2m_gtsam.slam.online.start_search import StartSearchState
 from l2m_gtsam.slam.online.step_doubts import StepDecision
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, refuse_offline_only
+from l2m_gtsam.slam.options import SlamOptions, refuse_offline_only
 from l2m_gtsam.slam.slips import FAR_M
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
@@ -69,6 +69,11 @@ class OnlineSlam:
         Registers scans on the cloud of the map or, where there is none, on those of earlier visits;
         without it scans take no part.
 
+    Attributes
+    ----------
+    field_map
+        The map in its form for solvers, if there is one.
+
     Raises
     ------
     InputError
@@ -96,7 +101,7 @@ class OnlineSlam:
         refuse_offline_only(options, has_map=field_map is not None, one_field=self._one_field)
         self.sensors = self.given_sensors = known_sensors(usable)
         self.options = with_calibration_use(options, self.sensors, one_field=self._one_field)
-        self._map = None if field_map is None else for_solvers(field_map)
+        self.field_map = None if field_map is None else for_solvers(field_map)
         self.matcher = matcher
         axes = None if field_map is None else np.array([1.0, 1.0, options.drift.of_height])
         # The axes of the one field are the first key pose's, of which none need be vertical.
@@ -169,7 +174,7 @@ class OnlineSlam:
             self.search = self._search_from(first, [])
             return
         start = start_pose(first, start_options)
-        if self._map is None:
+        if self.field_map is None:
             if not start_options.is_given:
                 start = replace(start, covariance=EXACT_START)
             if self._one_field:
@@ -190,15 +195,8 @@ class OnlineSlam:
         return StartSearchState(start_pose(first, self.options.start), waiting, window_m)
 
     def _follower(self, start: StartPose) -> BranchedFollower:
-        free, robust = self.options.calibration is CalibrationUse.REFINED, self.options.robust
-        over_m = self.options.drift.over_m
-        follower = Follower(start, self.sensors, self.known_map(), robust, over_m, free=free)
+        follower = Follower(start, self.sensors, self.known_map(), self.options)
         return BranchedFollower(Branch(follower))
-
-    @property
-    def field_map(self) -> QueryableMap | None:
-        """The map in its form for solvers, if there is one."""
-        return self._map
 
     def known_map(self) -> QueryableMap:
         """Return the map.
@@ -208,14 +206,14 @@ class OnlineSlam:
         ConfigError
             There is none.
         """
-        if self._map is None:
+        if self.field_map is None:
             raise ConfigError("a map is needed for this: give one with --map")
-        return self._map
+        return self.field_map
 
     def _added(self, key_pose: ArrivedKeyPose) -> Iterator[OnlinePose]:
         """Yield the key poses that are known by a new one."""
         following = isinstance(self.estimator, BranchedFollower)
-        if key_pose.lost and following and isinstance(self._map, Surveyed):
+        if key_pose.lost and following and isinstance(self.field_map, Surveyed):
             self._lose(key_pose)
             return
         if self.search is not None and key_pose.lost:
@@ -276,7 +274,7 @@ class OnlineSlam:
         for each in self.watch.refuted(belief.known_sensors):
             self._report(EventKind.CALIBRATION_REFUTED, each.warning())
         wrong = self._wrong_over_gaps(estimator)
-        if any(each.off_m > FAR_M for each in wrong) and isinstance(self._map, Surveyed):
+        if any(each.off_m > FAR_M for each in wrong) and isinstance(self.field_map, Surveyed):
             self._lose(key_pose)
         return OnlinePose.of(key_pose.stamp_ns, belief)
 

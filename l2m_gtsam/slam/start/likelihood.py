@@ -18,7 +18,7 @@ likelihoods are needed; GTSAM solves the drive from the best pose.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 from scipy.spatial.transform import Rotation
 
 from l2m_factors import key_pose_residuals, skew
@@ -97,14 +97,6 @@ def map_root(errors: SharedMapErrors, C: FloatArray) -> FloatArray:
     return np.asarray(
         solve_triangular(W, np.concatenate(columns, axis=1).T, lower=True, trans="T").T
     )
-
-
-def block_diagonal(blocks: FloatArray) -> FloatArray:
-    """Return N blocks, shape (N, 3, 3), as one matrix, shape (3N, 3N)."""
-    N = len(blocks)
-    S = np.zeros((N, 3, N, 3))
-    S[np.arange(N), :, np.arange(N)] = blocks
-    return S.reshape(3 * N, 3 * N)
 
 
 def diagonal_blocks(S: FloatArray) -> FloatArray:
@@ -230,7 +222,7 @@ class WindowFit:
         variance = np.where(prediction.inside[:, None], variance, 0.0)
         share = map_covariance(where.C, where.readings.R_map_lidar, variance)
         noise = window.sensors.noise[where.readings.sensor]
-        S = block_diagonal(reading_covariance(noise, share))
+        S = block_diag(*reading_covariance(noise, share))
         root = np.concatenate(roots, axis=1)
         return np.asarray(S + root @ root.T)
 

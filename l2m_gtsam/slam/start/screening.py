@@ -26,11 +26,10 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.slam.options import StartSearchOptions
-from l2m_gtsam.slam.start.window import Pattern
+from l2m_gtsam.slam.start.window import AXES, Pattern
 
 MOST_BOX = 10_000_000  # nodes; those that the map has data for take 150 bytes each
 NEAR = 1.0  # metres from a reading of the survey: further off no map is asked
-AXES = 3
 FURTHEST = np.sqrt(AXES) / 2  # steps from a place to its nearest node
 LARGEST = 16.0  # of a squared residual in sigmas: passed once in a thousand readings by noise
 MEAN = 3.0  # of it, by noise
@@ -38,6 +37,31 @@ MOST_KEPT = 20_000  # limit of hypotheses that are kept, the best
 COARSEST = np.deg2rad(10.0)  # between headings
 SIGMAS = 4.0  # of their sum
 GOLDEN = (np.sqrt(5) - 1) / 2
+
+
+class Nodes(NamedTuple):
+    """What a map has at the M nodes of a lattice.
+
+    Attributes
+    ----------
+    rows
+        Which node each of a box is, -1 for none, shape (nx, ny, nz).
+    field, gradient
+        Of the map, uT and uT/m, shapes (M, 3) and (M, 3, 3).
+    slope
+        Largest change of the field per metre, its gradient's largest singular value, shape (M,).
+    curvature
+        Largest deviation of the field from its tangent within a node's cell, uT, shape (M,).
+    variance
+        Of the map, mean of the axes, uT^2, shape (M,).
+    """
+
+    rows: IntArray
+    field: FloatArray
+    gradient: FloatArray
+    slope: FloatArray
+    curvature: FloatArray
+    variance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -50,29 +74,16 @@ class FieldLattice:
         Metres.
     lowest
         The first node of the box in steps, shape (3,).
-    rows
-        Which node of the lattice each of the box is, -1 for none, shape (nx, ny, nz).
     at
         Where each node is in the box, shape (M, 3).
-    field, gradient
-        Of the map, uT and uT/m, shapes (M, 3) and (M, 3, 3).
-    slope
-        Largest change of the field per metre, its gradient's largest singular value, shape (M,).
-    curvature
-        Largest deviation of the field from its tangent within a node's cell, uT, shape (M,).
-    variance
-        Of the map, mean of the axes, uT^2, shape (M,).
+    nodes
+        What the map has there.
     """
 
     step: float
     lowest: IntArray
-    rows: IntArray
     at: IntArray
-    field: FloatArray
-    gradient: FloatArray
-    slope: FloatArray
-    curvature: FloatArray
-    variance: FloatArray
+    nodes: Nodes
 
     def __len__(self) -> int:
         return len(self.at)
@@ -90,7 +101,8 @@ class FieldLattice:
     @property
     def spread(self) -> float:
         """Standard deviation of the field over the lattice, per axis, uT."""
-        return float(np.sqrt(np.mean((self.field - self.field.mean(axis=0)) ** 2)))
+        field = self.nodes.field
+        return float(np.sqrt(np.mean((field - field.mean(axis=0)) ** 2)))
 
 
 def lattice_over(field_map: QueryableMap, survey: TrainingSet, step: float) -> FieldLattice:
@@ -122,9 +134,8 @@ def lattice_over(field_map: QueryableMap, survey: TrainingSet, step: float) -> F
     slope = np.asarray(np.linalg.svd(gradient, compute_uv=False)[:, 0])
     curvature = FURTHEST**2 * remainder(rows, at, field, gradient, step)
     variance = sample.variance[sample.inside].mean(axis=1)
-    return FieldLattice(
-        step, lowest, rows, at, field, gradient, slope, np.asarray(curvature), variance
-    )
+    nodes = Nodes(rows, field, gradient, slope, np.asarray(curvature), variance)
+    return FieldLattice(step, lowest, at, nodes)
 
 
 def nodes_near(survey: TrainingSet, step: float) -> tuple[IntArray, BoolArray]:
@@ -200,17 +211,6 @@ class Rules(NamedTuple):
     limit: float
     most_unknown: int
     tilt2: float
-
-
-class Nodes(NamedTuple):
-    """The arrays of a ``FieldLattice``, for the compiled kernel."""
-
-    rows: IntArray
-    field: FloatArray
-    gradient: FloatArray
-    slope: FloatArray
-    curvature: FloatArray
-    variance: FloatArray
 
 
 @njit(cache=True, nogil=True)
@@ -331,12 +331,13 @@ def screen(
     """
     turn = heading_step(pattern.radius, lattice.step)
     headings = turn * np.arange(round(2 * np.pi / turn))
-    pattern = in_turn(pattern)
-    rules, arrays, at = rules_of(pattern, options), nodes_of(lattice), lattice.at[nodes]
+    # In an order that spreads the first readings: nodes are rejected early.
+    pattern = pattern[np.argsort(GOLDEN * np.arange(len(pattern.x)) % 1, kind="stable")]
+    rules, at = rules_of(pattern, options), lattice.at[nodes]
 
     def at_heading(yaw: float) -> StartHypotheses:
         score = np.empty(len(nodes))
-        write_scores(at, arrays, heading(pattern, lattice.step, yaw, turn), rules, score)
+        write_scores(at, lattice.nodes, heading(pattern, lattice.step, yaw, turn), rules, score)
         kept = np.flatnonzero(np.isfinite(score))
         return StartHypotheses(lattice.places(nodes[kept]), np.full(len(kept), yaw), score[kept])
 
@@ -360,16 +361,6 @@ def rules_of(pattern: Pattern, options: StartSearchOptions) -> Rules:
     return Rules(
         float(noise + wrong * (LARGEST + 1)), int((1 - options.least_inside) * N), pattern.tilt**2
     )
-
-
-def in_turn(pattern: Pattern) -> Pattern:
-    """Return the readings in an order that spreads the first ones: nodes are rejected early."""
-    return pattern[np.argsort(GOLDEN * np.arange(len(pattern.x)) % 1, kind="stable")]
-
-
-def nodes_of(lattice: FieldLattice) -> Nodes:
-    """Return the arrays of a lattice."""
-    return Nodes(*(getattr(lattice, name) for name in Nodes._fields))
 
 
 def heading(pattern: Pattern, step: float, yaw: float, turn: float) -> Heading:

@@ -26,6 +26,7 @@ from l2m_gtsam.slam.start.screening import FieldLattice, StartHypotheses, lattic
 from l2m_gtsam.slam.start.window import DriveWindow, Pattern, window_of
 
 MOST_NAMED = 4  # candidates in a message
+ELSEWHERE = "another place, a start outside of the map, or a wrong calibration"
 REMEDY = "a longer drive, one that turns, or `slam.start.position` and `quaternion_xyzw` settle it"
 STRIDE = 1.5  # steps of the lattice: places nearer to a better one are not followed
 SMALLEST = 0.5  # metres: least radius of the circle of headings
@@ -78,13 +79,13 @@ def verdict_of(
 ) -> tuple[StartVerdict, str]:
     """Return the verdict and the reason for it."""
     if not candidates:
-        return StartVerdict.NOT_HERE, f"no place of the map explains the readings: {elsewhere()}"
+        return StartVerdict.NOT_HERE, f"no place of the map explains the readings: {ELSEWHERE}"
     best = candidates[0]
     if not explains(best, options):
         message = (
             f"no place of the map explains the readings: at the best, {named(best)}, it has data "
             f"for {best.inside:.0%} of them, explains {best.explained:.0%} of these and leaves "
-            f"{best.chi2_per_dof:.1f} times the variance of their errors: {elsewhere()}"
+            f"{best.chi2_per_dof:.1f} times the variance of their errors: {ELSEWHERE}"
         )
         return StartVerdict.NOT_HERE, message
     if margin < options.clear:
@@ -102,11 +103,6 @@ def verdict_of(
         )
         return StartVerdict.AMBIGUOUS, message
     return StartVerdict.UNIQUE, f"one place explains the readings: {named(best)}"
-
-
-def elsewhere() -> str:
-    """Return possible reasons that nothing fits."""
-    return "another place, a start outside of the map, or a wrong calibration"
 
 
 def explains(candidate: StartCandidate, options: StartSearchOptions) -> bool:

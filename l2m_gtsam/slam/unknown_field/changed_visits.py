@@ -13,6 +13,7 @@ odometry and by other tiles, is that of ``visit_graph``.
 """
 
 from dataclasses import dataclass
+from typing import Self
 
 import gtsam
 import numpy as np
@@ -59,17 +60,25 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Remembered:
-    """What readings say of a tile's m weights, besides their prior.
+class Information:
+    """What is known of k numbers, in information form.
 
     Attributes
     ----------
     information, pulled
-        Sums over readings, shapes (m, m) and (m,).
+        Shapes (k, k) and (k,).
     """
 
     information: FloatArray
     pulled: FloatArray
+
+    def __add__(self, other: Self) -> Self:
+        """Return what both say."""
+        return type(self)(self.information + other.information, self.pulled + other.pulled)
+
+
+class Remembered(Information):
+    """What readings say of a tile's weights, besides their prior: sums over readings."""
 
     @classmethod
     def of(cls, tile: LinearField, seen: Seen) -> "Remembered":
@@ -77,10 +86,6 @@ class Remembered:
         root = 1 / np.sqrt(seen.variance)
         white = (tile.features(seen.points) * root[:, :, None]).reshape(-1, len(tile))
         return cls(white.T @ white, white.T @ (seen.field * root).ravel())
-
-    def __add__(self, other: "Remembered") -> "Remembered":
-        """Return what both say."""
-        return Remembered(self.information + other.information, self.pulled + other.pulled)
 
     @property
     def evidence(self) -> float:
@@ -153,18 +158,8 @@ class VisitResiduals:
         return cls(visit.field - field, D, tile.features(visit.points))
 
 
-@dataclass(frozen=True)
-class Motion:
-    """A motion of six numbers in information form: a right perturbation of a pose.
-
-    Attributes
-    ----------
-    information, pulled
-        Shapes (6, 6) and (6,).
-    """
-
-    information: FloatArray
-    pulled: FloatArray
+class Motion(Information):
+    """A motion of six numbers: a right perturbation of a pose."""
 
 
 @dataclass(frozen=True)
@@ -217,19 +212,15 @@ class VisitEvidence:
 
     def followed_by(self, later: "VisitEvidence") -> "VisitEvidence":
         """Return what both parts of a visit say if nothing had changed before the later one."""
-        first, constant = self.motions[0], self.constant[0] + later.constant
-        pairs = [
-            Motion(first.information + each.information, first.pulled + each.pulled)
-            for each in later.motions
-        ]
-        return VisitEvidence(tuple(pairs), constant)
+        both = tuple(self.motions[0] + each for each in later.motions)
+        return VisitEvidence(both, self.constant[0] + later.constant)
 
     def likelihoods(self, known: Motion) -> FloatArray:
         """Return how likely each share is with what is known of the motion, in nats."""
         values = []
         for own, constant in zip(self.motions, self.constant, strict=True):
-            factor = cho_factor(known.information + own.information)
-            pulled = known.pulled + own.pulled
+            both = known + own
+            factor, pulled = cho_factor(both.information), both.pulled
             log_det = 2 * float(np.log(np.diag(factor[0])).sum())
             values.append(constant + 0.5 * (float(pulled @ cho_solve(factor, pulled)) - log_det))
         return np.array(values)

@@ -105,6 +105,13 @@ class Explorer:
     pace
         How often is solved, and how much together.
 
+    Attributes
+    ----------
+    memory
+        Without the last stretch.
+    belief
+        The posterior of the last key pose.
+
     Raises
     ------
     ConfigError
@@ -123,7 +130,7 @@ class Explorer:
         self.start, self._sensors, self._options = start, sensors, options
         self._pace = ExploringOptions() if pace is None else pace
         refined = options.calibration is CalibrationUse.REFINED
-        self._memory = FieldMemory.at_start(start, sensors if refined else None)
+        self.memory = FieldMemory.at_start(start, sensors if refined else None)
         self._waiting: list[ArrivedKeyPose] = []  # until they are solved
         self._reckoned = dict[int, gtsam.Pose3]()  # where odometry has these
         self._work: Iterator[None] | None = None  # on the section, which is not finished
@@ -131,22 +138,12 @@ class Explorer:
         self._read = ReadPath()  # until the field is learnt
         self._first, self._solved = 0, -1
         self._past: list[MarginalizedPose] = []
-        self._belief = self._prior()
+        self.belief = self._prior()
         self._section: OpenSection | None = None
         self._other: OpenSection | None = None  # the less likely where steps over gaps are in doubt
         self._doubts: list[int] = []  # times of their ends
         self._recorded = True  # whether these are as recorded in the likelier section
         self._decisions: dict[int, bool] = {}
-
-    @property
-    def memory(self) -> FieldMemory:
-        """The memory, without the last stretch."""
-        return self._memory
-
-    @property
-    def belief(self) -> Belief:
-        """The posterior of the last key pose."""
-        return self._belief
 
     def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior.
@@ -170,7 +167,7 @@ class Explorer:
                 self._work = self._solving(self._section)
             for _ in range(max(round(key_pose.length_m / PIECE_M), 1)):
                 self._go_on()
-        return self._belief
+        return self.belief
 
     def finish(self) -> Belief:
         """Solve for the key poses that odometry alone has had so far; with few readings it stays.
@@ -186,15 +183,11 @@ class Explorer:
         if self._section is not None and self._waiting:
             self._work = self._solving(self._section)
             self._complete()
-        return self._belief
+        return self.belief
 
     @classmethod
     def resumed(
-        cls,
-        state: "ExplorerState",
-        start: StartPose,
-        sensors: KnownSensors,
-        options: SlamOptions,
+        cls, state: "ExplorerState", start: StartPose, sensors: KnownSensors, options: SlamOptions
     ) -> "Explorer":
         """Return an explorer that goes on from a state; other parameters are those of the class."""
         own = cls(start, sensors, options)
@@ -202,34 +195,36 @@ class Explorer:
             for each in state.waiting:
                 own.add(each)
             return own
-        own._memory, own._past = state.memory, list(state.past)
+        own.memory, own._past = state.memory, list(state.past)
         own._first = own._solved = state.last
         here = frozenset({state.memory.tile_at(state.last, state.prior.options.core)})
         own._section = OpenSection(sensors, state.prior, options, state.memory, state.last, here)
-        own._belief = state.memory.belief(state.last, sensors)
+        own.belief = state.memory.belief(state.last, sensors)
         return own
 
     def state(self) -> "ExplorerState":
         """Solve for what is waiting, close the section, and return what is to be kept."""
         if self._section is None:
-            return ExplorerState(None, self._memory, (), tuple(self._waiting), 0)
+            return ExplorerState(None, self.memory, (), tuple(self._waiting), 0)
         self.finish()
         if self._solved > self._first:
             self._work = self._handing_over(self._section, self._solved, self._solved_m)
             self._complete()
-        return ExplorerState(self._section.prior, self._memory, tuple(self._past), (), self._solved)
+        return ExplorerState(
+            self._section.field_prior, self.memory, tuple(self._past), (), self._solved
+        )
 
     def estimate(self, number: int) -> PoseEstimate:
         """Return a key pose as it is known now; that of a marginalised one is its anchor's."""
         if self._section is None or number > self._solved:
             pose = self._reckoned[number]
-            return PoseEstimate(as_transform(pose), self._belief.pose_covariance)
+            return PoseEstimate(as_transform(pose), self.belief.pose_covariance)
         if number >= len(self._past):
             T = as_transform(self._section.pose(number))
-            return PoseEstimate(T, self._belief.pose_covariance)
+            return PoseEstimate(T, self.belief.pose_covariance)
         past = self._past[number]
         T_map_anchor = as_transform(self._section.pose(past.anchor))
-        known = self._memory.known.marginal([X(past.anchor)]).covariance
+        known = self.memory.known.marginal([X(past.anchor)]).covariance
         step = as_transform(past.T_anchor_key)
         return carried_on(PoseEstimate(T_map_anchor, known), step, self._options.drift)
 
@@ -258,28 +253,28 @@ class Explorer:
         section = self._section
         anchors = np.array([each.anchor for each in self._past])
         points, field = np.empty((len(anchors), 3)), np.empty((len(anchors), 3))
-        for tile in self._memory.tiles:
+        for tile in self.memory.tiles:
             rows = np.flatnonzero(anchors == tile.anchor)
             if not len(rows):
                 continue
             anchor = section.pose(tile.anchor)
             own = np.stack([self._past[row].T_anchor_key.translation() for row in rows])
-            weights = self._memory.known.values.atVector(M(tile.number))
+            weights = self.memory.known.values.atVector(M(tile.number))
             R, p = anchor.rotation().matrix(), anchor.translation()
             points[rows] = own @ R.T + p
             field[rows] = tile.field.field_and_gradient(own, weights)[0] @ R.T
         return points, field
 
     def _prior(self) -> Belief:
-        return self._memory.belief(0, self._sensors)
+        return self.memory.belief(0, self._sensors)
 
     def _learn(self) -> None:
         """Learn the prior at the poses of odometry, and solve for the key poses so far."""
         part = drive_of(self._waiting, self.start, self._sensors)
         prior = drive_prior(part, part.dead_reckoning(), self._options.tiles)
-        self._section = OpenSection(self._sensors, prior, self._options, self._memory, 0)
+        self._section = OpenSection(self._sensors, prior, self._options, self.memory, 0)
         waiting, self._waiting = self._waiting, []
-        self._belief, self._path_m = self._prior(), 0.0
+        self.belief, self._path_m = self._prior(), 0.0
         for each in waiting:
             self._waiting.append(each)
             self._dead_reckon(each)
@@ -294,10 +289,10 @@ class Explorer:
     def _dead_reckon(self, key_pose: ArrivedKeyPose) -> None:
         """Predict the belief by odometry."""
         if key_pose.number > 0:
-            predicted = self._belief.predicted(key_pose.step, key_pose.covariance)
-            self._belief = predicted.marginalize_previous()
+            predicted = self.belief.predicted(key_pose.step, key_pose.covariance)
+            self.belief = predicted.marginalize_previous()
             self._path_m += key_pose.length_m
-        self._reckoned[key_pose.number] = self._belief.pose
+        self._reckoned[key_pose.number] = self.belief.pose
 
     def _go_on(self) -> None:
         """Do a piece of the work on the section, if there is any."""
@@ -325,11 +320,11 @@ class Explorer:
         last = group[-1].number
         if self._is_done(section, last, path_m):
             yield from self._handing_over(section, last, path_m)
-            belief = self._memory.belief(last, self._sensors)
+            belief = self.memory.belief(last, self._sensors)
         self._solved, self._solved_m = last, path_m
         for each in self._waiting:
             belief = belief.predicted(each.step, each.covariance).marginalize_previous()
-        self._belief = belief
+        self.belief = belief
         self._reckoned = {k: each for k, each in self._reckoned.items() if k > self._solved}
 
     def _both_ways(
@@ -400,6 +395,6 @@ class Explorer:
             self._past.append(
                 MarginalizedPose(anchor, section.pose(anchor).between(section.pose(k)))
             )
-        self._memory = memory
+        self.memory = memory
         self._first, self._opened_m = last, path_m
-        self._section = section.next(self._memory, last)
+        self._section = section.next(self.memory, last)

@@ -10,16 +10,15 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from l2m_factors import D, T, X
+from l2m_factors import X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_pose, stacked
-from l2m_gtsam.slam.joint_gaussian import JointGaussian
+from l2m_gtsam.slam.joint_gaussian import JointGaussian, of_key_pose
 from l2m_gtsam.slam.map_prediction import sensors_in
-from l2m_gtsam.slam.online.belief import POSE, Belief
-from l2m_gtsam.slam.pose_graph import EXACT, calibration_values
+from l2m_gtsam.slam.online.belief import Belief
+from l2m_gtsam.slam.pose_graph import EXACT
 from l2m_gtsam.slam.unknown_field.tiles import WaveTile, level_axes, tile_about
 
-POSITION, DISTORTION = 3, 12  # components of a sensor's variables
 CALIBRATION = (ord("T"), ord("D"))
 
 
@@ -70,17 +69,12 @@ class FieldMemory:
     @classmethod
     def at_start(cls, start: StartPose, free: KnownSensors | None = None) -> "FieldMemory":
         """Return the memory before a drive; ``free`` has the calibrations that are variables."""
-        values, sizes = gtsam.Values(), {X(0): POSE}
-        values.insert(X(0), as_pose(start.T_map_lidar))
-        if free is None:
-            return cls(JointGaussian(values, sizes, start.covariance))
-        values.insert(calibration_values(free))
-        for i in range(len(free.names)):
-            sizes |= {T(i): POSITION, D(i): DISTORTION}
-        known = block_diag(start.covariance, *free.covariance)
-        # A calibration may state a parameter as exact.
-        known += np.diag(np.maximum(EXACT**2 - np.diag(known), 0.0))
-        return cls(JointGaussian(values, sizes, known))
+        known = start.covariance
+        if free is not None:
+            known = block_diag(known, *free.covariance)
+            # A calibration may state a parameter as exact.
+            known += np.diag(np.maximum(EXACT**2 - np.diag(known), 0.0))
+        return cls(of_key_pose(0, as_pose(start.T_map_lidar), free, known))
 
     @property
     def calibrations(self) -> list[int]:

@@ -1,12 +1,13 @@
 """A field that is linear in weights of unit prior variance: first weights, effective parameters."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
 from scipy.spatial import cKDTree
 
-from l2m_factors import ComplexityPenalty
+from l2m_factors import ComplexityPenalty, TileField
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.solve.robust import SEEDS
@@ -18,22 +19,33 @@ SHARE = 0.25  # of the readings of a place, beyond which rejected ones are no sp
 LARGE = 2.0  # length of a whitened residual beyond which a reading is downweighted
 
 
+@dataclass(frozen=True)
 class LinearField(ABC):
-    """Features of m weights, in the frame of the key pose that the field is fixed to."""
+    """Features of m weights, in the frame of the key pose that the field is fixed to.
 
-    @abstractmethod
+    Attributes
+    ----------
+    basis
+        m basis functions.
+    scale
+        Prior standard deviation of each one's weight, shape (m,).
+    """
+
+    basis: TileField
+    scale: FloatArray
+
     def __len__(self) -> int:
-        """Return m."""
+        return len(self.scale)
 
-    @abstractmethod
     def features(self, points: FloatArray, /) -> FloatArray:
         """Return the field of weights of unit prior variance in uT, shape (N, 3, m)."""
+        return self.basis.features(points) * self.scale
 
-    @abstractmethod
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray, /
     ) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
+        return self.basis.field_and_gradient(points, self.scale * weights)
 
     @abstractmethod
     def unresolved(self, points: FloatArray) -> FloatArray:

@@ -61,10 +61,7 @@ class Hypotheses:
         return self.all[0]
 
     def after(
-        self,
-        key_pose: ArrivedKeyPose,
-        follows: FieldFilter,
-        was_motion: bool | None,
+        self, key_pose: ArrivedKeyPose, follows: FieldFilter, was_motion: bool | None
     ) -> "Hypotheses":
         """Return what they are at the next key pose.
 

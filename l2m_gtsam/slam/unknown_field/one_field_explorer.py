@@ -16,7 +16,7 @@ odometry excludes is refused, and the drive goes on by odometry until the drive 
 key poses with their readings are kept, about a kilobyte of each.
 """
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -32,13 +32,8 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.field_filter import DeadReckoning, FieldFilter, FilterState
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import Hypotheses, Hypothesis, step_of
 from l2m_gtsam.slam.unknown_field.read_path import ReadPath
-from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, SmoothedDrive, end_state, smoothed
-from l2m_gtsam.slam.unknown_field.whole_field import (
-    COARSE,
-    WholePrior,
-    capped_prior,
-    spectrum_at,
-)
+from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, end_state, smoothed
+from l2m_gtsam.slam.unknown_field.whole_field import COARSE, WholePrior, full_prior, spectrum_at
 from l2m_gtsam.solve.chi_square import exceeded_by
 
 # Of the filter's noise. Slow errors count as white there: of errors that last 3 to 4 s, with a
@@ -108,6 +103,10 @@ class FollowedField:
     hypotheses: Hypotheses
 
 
+Pieces = Iterator[FollowedField | float | None]
+"""Work in pieces: the last yields the field, those before the share that is done or nothing."""
+
+
 class OneFieldExplorer:
     """Estimates poses and one field on line from the readings of one sensor.
 
@@ -117,19 +116,24 @@ class OneFieldExplorer:
         Prior of the first key pose, and the sensor.
     options
         As of a localisation.
+
+    Attributes
+    ----------
+    key_poses
+        All so far.
     """
 
     def __init__(self, start: StartPose, sensors: KnownSensors, options: SlamOptions) -> None:
         self.start, self._sensors, self._options = start, sensors, _of_short_drives(options)
         self._origin = as_pose(start.T_map_lidar)
-        self._key_poses: list[ArrivedKeyPose] = []
+        self.key_poses: list[ArrivedKeyPose] = []
         self._path_m, self._learnt_m = 0.0, 0.0
         self._read = ReadPath()
         self._reckoned = DeadReckoning.at_start()
         # The same less a drift near that of the estimate.
         self._drifting = DeadReckoning.at_start()
         self._now: FollowedField | None = None
-        self._work: Iterator[FollowedField | None] | None = None
+        self._work: Pieces | None = None
         self._open: list[int] = []  # steps in doubt that are not decided
         self._decisions: dict[int, StepDecision] = {}
         self._news: list[StepDecision] = []
@@ -140,15 +144,10 @@ class OneFieldExplorer:
         """Whether the prior of the field is learnt; until then poses are those of odometry."""
         return self._now is not None
 
-    @property
-    def key_poses(self) -> Sequence[ArrivedKeyPose]:
-        """All so far."""
-        return self._key_poses
-
     def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior."""
         key_pose = key_pose.as_mixture
-        self._key_poses.append(key_pose)
+        self.key_poses.append(key_pose)
         self._count_path(key_pose)
         if key_pose.recorded is not None:
             self._open.append(key_pose.number)
@@ -175,7 +174,7 @@ class OneFieldExplorer:
     def poses(self) -> list[gtsam.Pose3]:
         """Return all key poses, each by the readings until then."""
         if self._now is None:
-            return self._drive(len(self._key_poses)).dead_reckoning()
+            return self._drive(len(self.key_poses)).dead_reckoning()
         return [self._origin.compose(each) for each in self._now.hypotheses.best.poses]
 
     def field_along_path(self) -> tuple[FloatArray, FloatArray]:
@@ -208,7 +207,7 @@ class OneFieldExplorer:
         prior = None if self._now is None else self._now.prior
         beginning = None if self._now is None else self._now.beginning
         decisions = tuple(self._decisions.values())
-        return OneFieldState(tuple(self._key_poses), prior, beginning, self._learnt_m, decisions)
+        return OneFieldState(tuple(self.key_poses), prior, beginning, self._learnt_m, decisions)
 
     @classmethod
     def resumed(
@@ -220,7 +219,7 @@ class OneFieldExplorer:
             own._count_path(each)
             own._dead_reckon(each)
         own._decisions = {each.number: each for each in state.decisions}
-        own._key_poses = list(state.key_poses)
+        own.key_poses = list(state.key_poses)
         doubts = [each.number for each in state.key_poses if each.recorded is not None]
         own._open = [number for number in doubts if number not in own._decisions]
         own._learnt_m = state.learnt_m
@@ -264,30 +263,33 @@ class OneFieldExplorer:
         recorded = self._recorded
         chosen = [
             each if each.recorded is None or each.number not in recorded else each.recorded
-            for each in self._key_poses[:count]
+            for each in self.key_poses[:count]
         ]
         return drive_of(chosen, self.start, self._sensors)
 
-    def _due(self, now: FollowedField | None) -> Iterator[FollowedField | None] | None:
+    def _due(self, now: FollowedField | None) -> Pieces | None:
         """Return work that is due, to be done in pieces."""
         is_long = self._read.length_m >= self._options.whole_field.solve_after_m
         if not (self._read.is_enough and is_long):
             return None
         inside = now is not None and _is_inside(now)
-        if inside and len(self._key_poses) > MOST:
+        if inside and len(self.key_poses) > MOST:
             return None
         growth = GROWN if inside else LEFT
         return self._learning(now) if self._path_m >= growth * self._learnt_m else None
 
-    def _learning(self, now: FollowedField | None) -> Iterator[FollowedField | None]:
+    def _learning(self, now: FollowedField | None) -> Pieces:
         """Solve the drive so far, and follow the rest, in pieces."""
         self._learnt_m = self._path_m
         # A step that nothing has decided yet is followed both ways.
-        count = min([len(self._key_poses), *self._open])
+        count = min([len(self.key_poses), *self._open])
         recorded = frozenset(each for each in self._recorded if each < count)
         drive = self._drive(count)
         solvable = LEAST <= count <= MOST and len(drive.readings) >= FEWEST
-        smooth = (yield from self._smoothing(drive)) if solvable else None
+        smooth = None
+        if solvable:
+            initial = drive.dead_reckoning()
+            smooth = yield from smoothed(drive, initial, self._options, ON_LINE)
         if smooth is not None:
             poses = smooth.stage.last.poses
             relative = tuple(poses[0].between(pose) for pose in poses)
@@ -295,23 +297,12 @@ class OneFieldExplorer:
             yield None
             yield from self._following(smooth.prior, beginning)
             return
-        options, everything = self._options.whole_field, self._drive(len(self._key_poses))
+        options, everything = self._options.whole_field, self._drive(len(self.key_poses))
         first, poses = None if now is None else now.prior.spectrum, self.poses()
         spectrum = spectrum_at(everything, poses, options, COARSE, first)
         yield None
-        prior = capped_prior(everything, poses, options, spectrum, COARSE)
+        prior = full_prior(everything, poses, spectrum, COARSE).capped(options.waves)
         yield from self._following(prior, None)
-
-    def _smoothing(self, drive: Drive) -> Generator[None, None, SmoothedDrive | None]:
-        """Solve a drive in pieces; return None where the field has too much detail for that."""
-        work = smoothed(drive, drive.dead_reckoning(), self._options, ON_LINE)
-        while True:
-            try:
-                next(work)
-            except StopIteration as end:
-                found: SmoothedDrive | None = end.value
-                return found
-            yield None
 
     def _is_possible(self, now: FollowedField) -> bool:
         """Return whether odometry, with the drift that is stated, can have been so far off."""
@@ -320,7 +311,7 @@ class OneFieldExplorer:
             return True
         if np.abs(state.steady - self._drifting.drift).max() > NEAR_DRIFT:
             self._drifting = DeadReckoning.at_start(state.steady)
-            for each in self._key_poses[1:]:
+            for each in self.key_poses[1:]:
                 self._drifting = self._drifting.after(step_of(each))
         return self._drifting.squared_distance(state.pose) <= IMPOSSIBLE
 
@@ -330,9 +321,7 @@ class OneFieldExplorer:
         self._learnt_m = self._path_m
         self._has_refused = True
 
-    def _following(
-        self, prior: WholePrior, beginning: SolvedBeginning | None
-    ) -> Iterator[FollowedField | None]:
+    def _following(self, prior: WholePrior, beginning: SolvedBeginning | None) -> Pieces:
         """Follow all key poses from a beginning, or the start, on, in pieces.
 
         Yields nothing, and at last the result.
@@ -347,8 +336,8 @@ class OneFieldExplorer:
             known = Hypothesis(beginning.state, beginning.poses, beginning.recorded)
             hypotheses, done = Hypotheses((known,)), len(beginning.poses)
         anew = FollowedField(prior, beginning, follows, hypotheses)
-        while done < len(self._key_poses):
-            anew = self._after(anew, self._key_poses[done])
+        while done < len(self.key_poses):
+            anew = self._after(anew, self.key_poses[done])
             done += 1
             if done % PIECE == 0:
                 yield None
@@ -364,7 +353,7 @@ class OneFieldExplorer:
     def _go_on(self) -> None:
         """Do a piece of the work, if there is any."""
         found = None if self._work is None else next(self._work)
-        if found is not None:
+        if isinstance(found, FollowedField):
             self._now, self._work = found, None
             self._decide(found.hypotheses)
 

@@ -47,6 +47,15 @@ class OpenSection:
         Its first key pose; readings before it have counted in the section before.
     before
         Tiles of the section before, which the vehicle does not come to anew.
+
+    Attributes
+    ----------
+    field_prior
+        The prior of the field.
+    key_poses
+        All after the first.
+    moved_m
+        How far readings moved one of them when they were solved last, at most.
     """
 
     def __init__(
@@ -59,48 +68,26 @@ class OpenSection:
         before: Set[int] = frozenset(),
     ) -> None:
         self._sensors = sensors_in(memory.known.values, sensors)
-        self._field_prior, self._options = prior, options
+        self.field_prior, self._options = prior, options
         self._memory, self._tiles = memory, list(memory.tiles)
         self._calibrations = memory.calibrations
         self._first = self._last = first
         self._tiles_before = before
-        self._key_poses: list[ArrivedKeyPose] = []
+        self.key_poses: list[ArrivedKeyPose] = []
         self._fixed = None if self._calibrations else sensors.fixed()
         self._of_section = SectionReadings(joined_readings([]), self._fixed)
         self._shared = [X(first), *self._calibrations]  # with the memory
         self._values = part_of(memory.known.values, self._shared)
         self._tile_of: dict[int, int] = {}
         self._counted: list[TileReadings] = []
-        self._moved_m = 0.0
+        self.moved_m = 0.0
         self._prior: gtsam.NonlinearFactorGraph | None = None
         self._after = memory.known  # of the variables that the memory keeps or shares
         self._promised = 0.0  # decrease of the error by another step
 
-    @property
-    def prior(self) -> FieldPrior:
-        """The prior of the field."""
-        return self._field_prior
-
-    @property
-    def moved_m(self) -> float:
-        """How far readings moved one of the key poses when they were solved last, at most."""
-        return self._moved_m
-
-    @property
-    def key_poses(self) -> Sequence[ArrivedKeyPose]:
-        """All after the first."""
-        return self._key_poses
-
     def begun_anew(self) -> "OpenSection":
         """Return the same section without key poses, as which other ones may be solved."""
-        return OpenSection(
-            self._sensors,
-            self._field_prior,
-            self._options,
-            self._memory,
-            self._first,
-            self._tiles_before,
-        )
+        return self._anew(self._memory, self._first, self._tiles_before)
 
     def log_likelihood(self) -> float:
         """Return that of its readings, poses and field integrated out about the solution.
@@ -112,7 +99,7 @@ class OpenSection:
         graph.push_back(prior_factors(prior))
         left = Marginals(graph.linearize(self._values), colamd_ordering(graph)).log_determinant()
         known = np.linalg.slogdet(prior.covariance)[1]
-        known += sum(np.linalg.slogdet(each.covariance)[1] for each in self._key_poses)
+        known += sum(np.linalg.slogdet(each.covariance)[1] for each in self.key_poses)
         largest = self._options.robust.largest
         volume = sum(each.log_volume(self._sensors, largest) for each in self._counted)
         return float(volume - graph.error(self._values) - left - 0.5 * known)
@@ -122,8 +109,8 @@ class OpenSection:
 
         Yields between pieces of the work, of a linearisation each.
         """
-        self._key_poses += [each for each in new if each.number > self._first]
-        parts = [each.readings for each in self._key_poses]
+        self.key_poses += [each for each in new if each.number > self._first]
+        parts = [each.readings for each in self.key_poses]
         self._of_section = SectionReadings(joined_readings(parts), self._fixed)
         self._predict(new)
         if any(len(each.links) for each in new):
@@ -146,7 +133,7 @@ class OpenSection:
         if self._promised > CLOSE:
             yield from self._solved(graph, self._options.max_iterations - 1)
             yield from self._looked_at(graph)
-        self._moved_m = float(np.linalg.norm(self._places() - before, axis=1).max(initial=0.0))
+        self.moved_m = float(np.linalg.norm(self._places() - before, axis=1).max(initial=0.0))
         yield
 
     def belief(self) -> Belief:
@@ -192,8 +179,10 @@ class OpenSection:
 
     def next(self, memory: FieldMemory, first: int) -> "OpenSection":
         """Return a new section from a key pose on."""
-        tiles = frozenset(self._tile_of.values())
-        return OpenSection(self._sensors, self._field_prior, self._options, memory, first, tiles)
+        return self._anew(memory, first, frozenset(self._tile_of.values()))
+
+    def _anew(self, memory: FieldMemory, first: int, before: Set[int]) -> "OpenSection":
+        return OpenSection(self._sensors, self.field_prior, self._options, memory, first, before)
 
     def pose(self, number: int) -> gtsam.Pose3:
         """Return the estimate of a key pose of the section, or of the memory."""
@@ -220,7 +209,7 @@ class OpenSection:
         self._share([X(origin) for each in new for origin in each.links.origin.tolist()])
         graph, shared = self._motions(), [key for key in self._shared if is_pose(key)]
         graph.push_back(prior_factors(self._memory.known.marginal(shared)))
-        poses = [*shared, *(X(each.number) for each in self._key_poses)]
+        poses = [*shared, *(X(each.number) for each in self.key_poses)]
         values, most = part_of(self._values, poses), self._options.max_iterations
         order = colamd_ordering(graph)
         found = yield from stepwise_levenberg_marquardt(graph, values, order, most, CLOSE)
@@ -229,13 +218,13 @@ class OpenSection:
 
     def _places(self) -> FloatArray:
         """Return where the section's key poses are in metres, shape (K, 3)."""
-        places = [self.pose(each.number).translation() for each in self._key_poses]
+        places = [self.pose(each.number).translation() for each in self.key_poses]
         return np.array(places).reshape(-1, 3)
 
     def _enter(self, k: int) -> bool:
         """Assign a key pose to its tile; return whether the vehicle comes to it anew."""
         anchors = [self.pose(tile.anchor) for tile in self._tiles]
-        number = tile_of(self.pose(k), anchors, self._field_prior.options.core)
+        number = tile_of(self.pose(k), anchors, self.field_prior.options.core)
         self._tile_of[k] = number
         if number == len(self._tiles):
             field = self._waves(k)
@@ -264,12 +253,12 @@ class OpenSection:
     def _waves(self, anchor: int) -> WaveTile:
         """Return the waves of a new tile at a key pose; sensors and readings bound its height."""
         R, count = self.pose(anchor).rotation().matrix(), len(self._of_section.readings)
-        level, options = R.T @ level_axes(R[None])[0], self._field_prior.options
+        level, options = R.T @ level_axes(R[None])[0], self.field_prior.options
         x = self._sensors.t
         if count:
             x = np.vstack([x, self._place(np.arange(count), anchor).x])
         near = np.abs(x @ level[:, :2]).max(axis=1) <= options.edge / 2
-        return WaveTile.about(self._field_prior, level, x[near] if near.any() else x)
+        return WaveTile.about(self.field_prior, level, x[near] if near.any() else x)
 
     def _place(self, rows: IntArray, anchor: int) -> PlacedReadings:
         readings, origin = self._of_section.readings[rows], self.pose(anchor)
@@ -328,7 +317,7 @@ class OpenSection:
     def _motions(self) -> gtsam.NonlinearFactorGraph:
         """Return odometry and loops of scans."""
         graph = gtsam.NonlinearFactorGraph()
-        for each in self._key_poses:
+        for each in self.key_poses:
             graph.add(between_factor(each.number - 1, each.step, each.covariance))
             graph.push_back(link_graph(each.links))
         return graph

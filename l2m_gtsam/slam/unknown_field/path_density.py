@@ -20,11 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from l2m_factors import MagneticReadings, reading_residuals, skew
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.unknown_field.sensor_noise import NoiseInformation
+from l2m_gtsam.slam.unknown_field.sensor_noise import AXES, NoiseInformation
 from l2m_gtsam.slam.unknown_field.tiled_drive import FieldWithWeights
 from l2m_gtsam.slam.unknown_field.whole_field import WholeField
-
-AXES = 3
 
 
 @dataclass(frozen=True)

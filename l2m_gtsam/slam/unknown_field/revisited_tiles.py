@@ -16,6 +16,7 @@ from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import place_readings
+from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.changed_visits import Seen, VisitResiduals, trusted
 from l2m_gtsam.slam.unknown_field.tile_visits import (
@@ -33,7 +34,7 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     relative_place,
     visits_among,
 )
-from l2m_gtsam.slam.unknown_field.visit_graph import POSE, VisitGraph, ways_between
+from l2m_gtsam.slam.unknown_field.visit_graph import VisitGraph, ways_between
 from l2m_gtsam.solve.linear_algebra import RowBlocks
 
 KNOWN_M = 0.02  # standard deviation of a sensor's place, up to which tiles are judged

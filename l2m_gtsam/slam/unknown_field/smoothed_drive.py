@@ -27,7 +27,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import Drive, KnownSensors, as_pose, stacked
 from l2m_gtsam.slam.odometry import FixedStep
-from l2m_gtsam.slam.online.belief import POSE
+from l2m_gtsam.slam.online.belief import POSE, SENSOR
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, WholeFieldOptions
 from l2m_gtsam.slam.relative_motion import from_end
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
@@ -37,12 +37,7 @@ from l2m_gtsam.slam.unknown_field.path_information import PathNeighbourhood, det
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.tiled_smoother import TiledProblem, TiledRound
-from l2m_gtsam.slam.unknown_field.whole_field import (
-    WholeField,
-    WholePrior,
-    fine_prior,
-    learnt_prior,
-)
+from l2m_gtsam.slam.unknown_field.whole_field import WholePrior, fine_prior, learnt_prior
 
 CONVEX = 1.0  # of the loss, with weights at the poses of the filter
 # Factors of the noise. With the noise alone the likelihood has maxima between the poses of odometry
@@ -53,7 +48,6 @@ CLOSE = 0.5  # decrease of the error that moves poses by less than their sigmas
 # Sigmas of the ship's poses are 5 to 16 % larger than with 120, heights 26 %, in less than half the
 # time.
 VECTORS = 50
-SENSOR = 15
 
 
 @dataclass(frozen=True)
@@ -72,26 +66,17 @@ class FollowedDrive:
     log_likelihood: float
 
 
-def followed(drive: Drive, field: WholeField, origin: gtsam.Pose3, largest: float) -> FollowedDrive:
-    """Follow a drive.
-
-    Parameters
-    ----------
-    drive
-        Odometry and readings.
-    field
-        In the frame of the first key pose.
-    origin
-        The first key pose.
-    largest
-        Squared Mahalanobis length beyond which a reading does not count.
-    """
-    follows = FieldFilter(field, drive.sensors, largest)
+def followed(drive: Drive, prior: WholePrior, factor: float, options: SlamOptions) -> FollowedDrive:
+    """Follow a drive in one field, with so many times the noise, all of it white."""
+    sensors = drive.sensors.loosened(0.0, options.whole_field.offset)
+    noise = np.array([factor * prior.spectrum.noise.ut])
+    follows = FieldFilter(prior.field, replace(sensors, noise=noise), options.robust.largest)
     state = follows.start()
     poses = [state.pose]
-    for step in filter_steps(drive):
+    for step in filter_steps(drive.with_scale_as_drift(options.drift.over_m)):
         state = follows.after(state, step)
         poses.append(state.pose)
+    origin = as_pose(drive.start.T_map_lidar)
     return FollowedDrive([origin.compose(each) for each in poses], state.log_likelihood)
 
 
@@ -297,23 +282,12 @@ def followed_coarsely(drive: Drive, first: WholePrior, options: SlamOptions) -> 
     """
     prior = first
     for factor in FOLLOWED:
-        poses = followed_with(drive, prior, factor, options).poses
+        poses = followed(drive, prior, factor, options).poses
         learnt = learnt_prior(drive, poses, options.whole_field, prior.spectrum)
         if learnt is None:
             return None
         prior = learnt
     return LearntPoses(poses, prior)
-
-
-def followed_with(
-    drive: Drive, prior: WholePrior, factor: float, options: SlamOptions
-) -> FollowedDrive:
-    """Follow a drive in one field, with so many times the noise, all of it white."""
-    sensors = drive.sensors.loosened(0.0, options.whole_field.offset)
-    noise = np.array([factor * prior.spectrum.noise.ut])
-    heard = replace(drive, sensors=replace(sensors, noise=noise))
-    scaled = heard.with_scale_as_drift(options.drift.over_m)
-    return followed(scaled, prior.field, as_pose(drive.start.T_map_lidar), options.robust.largest)
 
 
 def end_state(smooth: SmoothedDrive) -> FilterState:

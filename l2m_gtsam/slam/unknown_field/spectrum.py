@@ -21,13 +21,12 @@ from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
-from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, whiten
+from l2m_gtsam.slam.unknown_field.sensor_noise import AXES, SensorNoise, whiten
 
 LEARNT_FROM = 300  # readings
 MARGIN = 1.5  # of the box about the path, in lengths of the field: on its faces the field is normal
 NEWTON, HALVINGS = 8, 20
 EVALUATIONS, AGAIN = 100, 50  # of the likelihood, and where it was searched before
-AXES = 3
 # Logarithms of: strength in that of the readings, length in m, noise in the same strength, odds of
 # white against slow noise, time of the latter in s.
 FIRST = np.array([0.0, 0.0, -2.0, -2.0, 0.7])

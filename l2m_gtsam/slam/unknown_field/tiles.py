@@ -15,11 +15,7 @@ from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn, maximise
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
-from l2m_gtsam.maps.harmonic.tiling import (
-    Resolution,
-    resolution_of,
-    surveyed_area,
-)
+from l2m_gtsam.maps.harmonic.tiling import Resolution, resolution_of, surveyed_area
 from l2m_gtsam.maps.training import TrainingSet, cubes_of, merged, training_set
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
@@ -139,18 +135,10 @@ def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) ->
 class WaveTile(LinearField):
     """Uniform field, floor and ceiling waves of a level box about an anchor, in its frame.
 
-    Attributes
-    ----------
-    basis
-        m basis functions.
-    scale
-        Prior standard deviation of each one's weight, shape (m,).
-    prior
-        From which they follow.
+    ``prior`` is that from which both follow.
     """
 
     basis: Basis
-    scale: FloatArray
     prior: FieldPrior
 
     @classmethod
@@ -177,19 +165,6 @@ class WaveTile(LinearField):
         learnt = np.exp(0.5 * basis.prior(prior.hyperparameters).log_variance)
         wider = np.append(np.ones(3), np.full(len(basis) - 3, WIDER))  # the uniform field is wide
         return cls(basis, wider * learnt, prior)
-
-    def __len__(self) -> int:
-        return len(self.scale)
-
-    def features(self, points: FloatArray, /) -> FloatArray:
-        """Return the field of weights of unit prior variance in uT, shape (N, 3, m)."""
-        return self.basis.features(points) * self.scale
-
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray, /
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
-        return self.basis.field_and_gradient(points, self.scale * weights)
 
     @property
     def half_wave(self) -> float:

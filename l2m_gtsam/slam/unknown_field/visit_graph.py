@@ -17,10 +17,9 @@ from l2m_factors import drift_weights
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.odometry import OdometrySteps
+from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.options import DriftOptions
 from l2m_gtsam.slam.unknown_field.changed_visits import MOTION, Motion
-
-POSE = 6
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.potential import PotentialBasis
 from l2m_gtsam.slam.drive import Drive, KnownSensors
-from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
 from l2m_gtsam.slam.options import WholeFieldOptions
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
@@ -55,33 +54,14 @@ COARSE, FINE = FieldDetail(200, 3.0), FieldDetail(600, 4.0)
 
 @dataclass(frozen=True)
 class WholeField(LinearField):
-    """The field of a drive in the frame of its first key pose.
-
-    Attributes
-    ----------
-    basis
-        Eigenfunctions in the box.
-    """
+    """The field of a drive in the frame of its first key pose, of eigenfunctions in a box."""
 
     basis: PotentialBasis
 
-    def __len__(self) -> int:
-        return len(self.basis)
-
-    @property
-    def scale(self) -> FloatArray:
-        """Prior standard deviation of each weight, shape (m,)."""
-        return np.asarray(np.sqrt(self.basis.variance))
-
-    def features(self, points: FloatArray, /) -> FloatArray:
-        """Return the field of weights of unit prior variance in uT, shape (N, 3, m)."""
-        return self.basis.features(points) * self.scale
-
-    def field_and_gradient(
-        self, points: FloatArray, weights: FloatArray, /
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
-        return self.basis.field_and_gradient(points, self.scale * weights)
+    @classmethod
+    def of(cls, basis: PotentialBasis) -> "WholeField":
+        """Return the field of eigenfunctions, whose weights have the variances that these state."""
+        return cls(basis, np.sqrt(basis.variance))
 
     def by_points(self, points: FloatArray, by_features: FloatArray) -> FloatArray:
         """Return the derivative of a scalar by points (N, 3), of one by features (N, 3, m)."""
@@ -124,7 +104,11 @@ class WholePrior:
     def field(self) -> WholeField:
         """The field in the box."""
         basis = PotentialBasis.over(self.low, self.high, self.spectrum.prior, self.waves)
-        return WholeField(basis)
+        return WholeField.of(basis)
+
+    def capped(self, most: int) -> "WholePrior":
+        """Return it with so many eigenfunctions at most: what shorter waves hold is noise."""
+        return replace(self, waves=min(self.waves, most))
 
     def divided(
         self, motions: RelativeMotions, poses: list[gtsam.Pose3], sensors: KnownSensors
@@ -170,9 +154,8 @@ def fine_prior(
     first: FieldSpectrum | None = None,
 ) -> WholePrior:
     """Learn the prior of a fine field, for good poses; parameters as of ``learnt_prior``."""
-    return capped_prior(
-        drive, poses, options, spectrum_at(drive, poses, options, FINE, first), FINE
-    )
+    spectrum = spectrum_at(drive, poses, options, FINE, first)
+    return full_prior(drive, poses, spectrum, FINE).capped(options.waves)
 
 
 def spectrum_at(
@@ -186,7 +169,7 @@ def spectrum_at(
 
     Other parameters as of ``learnt_prior``.
     """
-    where = placed(drive, poses)
+    where = relative_place(drive.readings, poses, 0, drive.sensors)
     x, R = where.x, where.readings.R_map_lidar
     few = np.linspace(0, len(x) - 1, min(len(x), LEARNT_FROM)).round().astype(int)
     corrected = np.einsum("nji,nj->ni", R, where.field(drive.sensors))
@@ -206,32 +189,15 @@ def prior_about(
     return prior if prior.waves <= options.waves else None
 
 
-def capped_prior(
-    drive: Drive,
-    poses: list[gtsam.Pose3],
-    options: WholeFieldOptions,
-    spectrum: FieldSpectrum,
-    detail: FieldDetail,
-) -> WholePrior:
-    """Return the prior of a field with any detail: what shorter waves hold counts as noise."""
-    prior = full_prior(drive, poses, spectrum, detail)
-    return replace(prior, waves=min(prior.waves, options.waves))
-
-
 def full_prior(
     drive: Drive, poses: list[gtsam.Pose3], spectrum: FieldSpectrum, detail: FieldDetail
 ) -> WholePrior:
     """Return the prior in a box about the poses with all waves that the field needs."""
-    x, margin = placed(drive, poses).x, MARGIN * spectrum.prior.length
+    x = relative_place(drive.readings, poses, 0, drive.sensors).x
+    margin = MARGIN * spectrum.prior.length
     low, high = x.min(axis=0) - margin, x.max(axis=0) + margin
     waves = waves_for(high - low, detail.cut / spectrum.prior.length)
     return WholePrior(spectrum, low, high, waves)
-
-
-def placed(drive: Drive, poses: list[gtsam.Pose3]) -> PlacedReadings:
-    """Return a drive's readings in the frame of its first key pose."""
-    relative = [poses[0].between(pose) for pose in poses]
-    return place_readings(drive.readings, relative, drive.sensors)
 
 
 def waves_for(size: FloatArray, cut: float) -> int:

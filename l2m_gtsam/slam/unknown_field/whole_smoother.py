@@ -4,9 +4,8 @@ The drive is solved by :mod:`.smoothed_drive`. Sigmas are those of the density w
 integrated out (:mod:`.path_information`), and poses are corrected where a gain is shown.
 """
 
-from collections.abc import Generator
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import gtsam
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.spatial.distance import cdist
 
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.progress import Progress
+from l2m_gtsam.progress import Progress, completed
 from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.map_prediction import PlacedReadings, poses_in
 from l2m_gtsam.slam.marginals import Marginals, pose_covariances
@@ -30,7 +29,7 @@ from l2m_gtsam.slam.unknown_field.smoothed_drive import (
     OFF_LINE,
     SmoothedDrive,
     SolvedStage,
-    followed_with,
+    followed,
     smoothed,
     solved_stage,
     stage_problem,
@@ -71,24 +70,13 @@ def map_whole_drive(
     The poses; those of odometry where nothing is shown to be gained by others. None where the field
     has more detail than one basis holds.
     """
-    found = reported(smoothed(drive, initial, options), progress)
+    stage = "solving poses and field"
+    found = completed(smoothed(drive, initial, options), partial(progress, stage))
     if found is None:
         return None
     solution = where_gained(drive, found, options)
-    progress("solving poses and field", 1.0)
+    progress(stage, 1.0)
     return solution
-
-
-def reported(
-    work: Generator[float, None, SmoothedDrive | None], progress: Progress
-) -> SmoothedDrive | None:
-    """Do work in pieces, and report the share that is done."""
-    while True:
-        try:
-            progress("solving poses and field", next(work))
-        except StopIteration as end:
-            found: SmoothedDrive | None = end.value
-            return found
 
 
 def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> FieldSolution:
@@ -194,7 +182,7 @@ class DriveLikelihood:
         prior = prior_about(drive, drive.dead_reckoning(), whole, self._spectrum)
         if prior is None:
             return -np.inf
-        return followed_with(drive, prior, FOLLOWED[0], self._options).log_likelihood
+        return followed(drive, prior, FOLLOWED[0], self._options).log_likelihood
 
     @cached_property
     def _spectrum(self) -> FieldSpectrum | None:

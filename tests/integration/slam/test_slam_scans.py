@@ -183,7 +183,7 @@ def test_scans_are_fixes_on_line_and_one_that_lies_is_left_out(
     known, drive = hall
     rng, truth = np.random.default_rng(5), drive.truth
     cloud, seen = mapped(ROOM, truth, rng), scanned(truth)
-    matcher = ScanMatcher(cloud, ScanLocalisationOptions(), 0.25, OPTIONS.drift)
+    matcher = ScanMatcher(cloud, ScanLocalisationOptions(), OPTIONS.drift)
     lying = [
         replace(each, points=each.points + np.array([0.0, 1.2, 0.0])) if k % 4 == 3 else each
         for k, each in enumerate(scans(ROOM, seen, rng))
@@ -208,7 +208,7 @@ class LoopsOnLine:
     def slam(self) -> OnlineSlam:
         """Return a localisation that closes loops."""
         largest = self.options.robust.largest_of(6)
-        matcher = LoopMatcher(LoopOptions(), 0.25, self.options.drift, largest)
+        matcher = LoopMatcher(LoopOptions(), self.options.drift, largest)
         return OnlineSlam(self.calibration, self.options, None, matcher)
 
 

@@ -95,8 +95,7 @@ def test_steps_without_the_drift_are_those_of_the_poses() -> None:
 
 def followed(drawn: DrawnDrive, seed: int, key_poses: Iterable[ArrivedKeyPose]) -> list[Belief]:
     drive, world = drawn.drive, dipole_world(seed)
-    robust, over_m = OPTIONS.robust, DRIFT.over_m
-    follower = Follower(drive.start, drive.sensors, world, robust, over_m, free=False)
+    follower = Follower(drive.start, drive.sensors, world, OPTIONS)
     return [follower.add(each) for each in key_poses]
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import M, X
 from l2m_gtsam.data import FieldSeries, Recording, SourceFile, Trajectory
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
-from l2m_gtsam.progress import silent
+from l2m_gtsam.progress import completed
 from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import EXACT_START
 from l2m_gtsam.slam.localisation import prepared
@@ -24,7 +24,6 @@ from l2m_gtsam.slam.unknown_field.smoothed_drive import (
     smoothed,
     with_noise,
 )
-from l2m_gtsam.slam.unknown_field.whole_smoother import reported
 from l2m_gtsam.studies.slam.methods import as_recorded
 
 COUNT, EVERY_S = 40, 0.5
@@ -51,7 +50,7 @@ def smooth() -> SmoothedDrive:
     )
     drive, _ = prepared(recording, as_recorded(0.3), options)
     drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
-    found = reported(smoothed(drive, drive.dead_reckoning(), options, ON_LINE), silent)
+    found = completed(smoothed(drive, drive.dead_reckoning(), options, ON_LINE))
     assert found is not None
     return found
 

@@ -39,7 +39,7 @@ LARGEST = float(chi2.ppf(0.9999, 3))
 def field() -> WholeField:
     prior = PotentialHyperparameters(sigma=5.0, length=1.0)
     low, high = np.array([-2.0, -2.0, -2.0]), np.array([6.0, 4.0, 2.0])
-    return WholeField(PotentialBasis.over(low, high, prior, WAVES))
+    return WholeField.of(PotentialBasis.over(low, high, prior, WAVES))
 
 
 def sensors(sigma: float = 1e-9) -> KnownSensors:

@@ -18,7 +18,7 @@ from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.slam.online.measurements import CELL_M, CachedVariance
-from l2m_gtsam.slam.options import CalibrationUse, DriftOptions, SlamOptions
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import calibration_values, odometry_graph, pose_values
 from l2m_gtsam.slam.smoother import SmoothingProblem
 from l2m_gtsam.solve.robust import RobustOptions
@@ -151,8 +151,8 @@ def test_a_field_that_bends_does_not_lead_astray() -> None:
 def test_what_a_key_pose_costs_does_not_grow() -> None:
     """The map is asked as often late in a drive as early, once the calibration has settled."""
     field_map, drive = CountingMap(WORLD), drawn(40.0).drive
-    start, robust, over_m = drive.start, RobustOptions(), DriftOptions().over_m
-    follower = Follower(start, drive.sensors, field_map, robust, over_m, free=True, section=20)
+    options = SlamOptions(calibration=CalibrationUse.REFINED)
+    follower = Follower(drive.start, drive.sensors, field_map, options, section=20)
     asked = []
     for key_pose in key_poses_of(drive):
         follower.add(key_pose)

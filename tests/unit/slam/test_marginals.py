@@ -12,7 +12,6 @@ from l2m_gtsam.slam.marginals import (
     Marginals,
     joint_posterior,
     net_covariance,
-    ordered,
     pose_covariances,
     reported_ill_conditioning,
 )
@@ -53,7 +52,7 @@ def test_determinants_are_those_of_the_dense_information() -> None:
     linear = graph.linearize(values)
     marginals = Marginals(linear, colamd_ordering(graph))
     keys = [X(k) for k in range(9)]
-    H = linear.hessian(ordered(keys))[0]
+    H = linear.hessian(gtsam.Ordering(keys))[0]
     assert marginals.log_determinant() == pytest.approx(0.5 * np.linalg.slogdet(H)[1], rel=1e-12)
     rows = np.r_[0:12, 18:24, 30:54]  # without the third and the fifth
     rest = np.linalg.inv(np.linalg.inv(H)[np.ix_(rows, rows)])
@@ -127,9 +126,9 @@ def test_covariances_are_in_the_order_asked_for_whatever_gtsam_eliminates_first(
         linear.add(gtsam.JacobianFactor(key, blocks[0], X(2), blocks[1], np.zeros(2), unit))
     out_of_turn = 0
     for keys in permutations(sizes):
-        net = linear.eliminateSequential(ordered(keys), gtsam.EliminateQR)
+        net = linear.eliminateSequential(gtsam.Ordering(keys), gtsam.EliminateQR)
         out_of_turn += net.at(0).firstFrontalKey() != keys[0]
-        H = linear.hessian(ordered(keys))[0]
+        H = linear.hessian(gtsam.Ordering(keys))[0]
         # The condition of H, 1e3, times rounding.
         np.testing.assert_allclose(net_covariance(net, keys), np.linalg.inv(H), rtol=1e-11)
     assert out_of_turn > 0

@@ -12,7 +12,7 @@ from l2m_gtsam.slam.options import DriftOptions
 
 
 def matcher() -> LoopMatcher:
-    return LoopMatcher(LoopOptions(), 0.25, DriftOptions(), 28.0)
+    return LoopMatcher(LoopOptions(), DriftOptions(), 28.0)
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

@@ -29,7 +29,7 @@ def along_a_path(waves: int = 60, margin: float = 1.0) -> tuple[PathReadings, Wh
     p = np.column_stack([np.linspace(0, 2, COUNT), rng.normal(0, 0.2, (COUNT, 2))])
     R = Rotation.from_rotvec(rng.normal(0, 0.6, (COUNT, 3))).as_matrix()
     low, high = p.min(axis=0) - margin, p.max(axis=0) + margin
-    field = WholeField(PotentialBasis.over(low, high, PRIOR, waves))
+    field = WholeField.of(PotentialBasis.over(low, high, PRIOR, waves))
     b = np.einsum("nji,nj->ni", R, field.features(p) @ rng.normal(size=len(field)))
     return PathReadings(R, p, b + rng.normal(size=b.shape)), field
 

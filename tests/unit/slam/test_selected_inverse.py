@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2m_factors import X
-from l2m_gtsam.slam.marginals import ordered
 from l2m_gtsam.slam.selected_inverse import ROOT, cliques_of, shared_covariances
 
 
@@ -42,8 +41,8 @@ def test_they_are_blocks_of_the_dense_inverse_whatever_the_order(
     graph, sizes, groups = random_graph(rng, count, factors)
     keys = rng.permutation(list(sizes)).tolist()
     by = (gtsam.EliminateQR,) if by_qr else ()
-    net = graph.eliminateSequential(ordered(keys), *by)
-    H = graph.hessian(ordered(list(sizes)))[0]
+    net = graph.eliminateSequential(gtsam.Ordering(keys), *by)
+    H = graph.hessian(gtsam.Ordering(list(sizes)))[0]
     dense, starts = np.linalg.inv(H), np.cumsum([0, *sizes.values()])
     start = dict(zip(sizes, starts.tolist(), strict=False))
     for group, found in zip(groups, shared_covariances(net, groups), strict=True):
@@ -71,6 +70,6 @@ def test_variables_without_a_common_factor_have_no_covariance_here() -> None:
     for k in range(2):
         unit = gtsam.noiseModel.Unit.Create(1)
         graph.add(gtsam.JacobianFactor(X(k), np.eye(1), np.zeros(1), unit))
-    net = graph.eliminateSequential(ordered([X(0), X(1)]))
+    net = graph.eliminateSequential(gtsam.Ordering([X(0), X(1)]))
     with pytest.raises(KeyError):
         shared_covariances(net, [[X(0), X(1)]])

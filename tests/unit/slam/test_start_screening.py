@@ -20,7 +20,6 @@ from l2m_gtsam.slam.start.screening import (
     heading,
     heading_step,
     lattice_over,
-    nodes_of,
     row_of,
     score_at,
     screen,
@@ -80,7 +79,7 @@ def test_the_node_next_to_the_truth_is_not_ruled_out(
     turn = heading_step(pattern.radius, STEP)
     near = turn * np.round(yaw / turn)
     at = lattice.at[nearest(lattice, p)]
-    score = score_at(at, nodes_of(lattice), heading(pattern, STEP, near, turn), ANYTHING)
+    score = score_at(at, lattice.nodes, heading(pattern, STEP, near, turn), ANYTHING)
     assert score <= squared(pattern, hall, p, yaw) + len(pattern.x)
 
 
@@ -91,19 +90,21 @@ def test_a_score_is_the_least_over_the_tilt(lattice: FieldLattice, seed: int) ->
     rng = np.random.default_rng(seed)
     node = int(rng.integers(len(lattice)))
     x = rng.uniform(-0.4, 0.4, (12, 3)) * [1, 1, 0.2]
-    field = lattice.field[node] + rng.normal(0, 1, (12, 3))
+    field = lattice.nodes.field[node] + rng.normal(0, 1, (12, 3))
     pattern = Pattern(x, field, np.full(12, 1.0), np.full(12, 0.1), TILT, np.zeros(3))
     laid = heading(pattern, STEP, 0.3, 0.05)
     rows, rhs = [np.eye(2) / TILT], [np.zeros(2)]
     total = 0.0
     for n in range(12):
-        row = row_of(lattice.rows, lattice.at[node], laid.node[n])
+        row = row_of(lattice.nodes.rows, lattice.at[node], laid.node[n])
         if row < 0:
             total += 4.0
             continue
-        b = lattice.field[row] + lattice.gradient[row] @ laid.rest[n]
-        tau = lattice.slope[row] * laid.moved[n] + laid.turned[n] + lattice.curvature[row]
-        s2 = 1.0 + lattice.variance[row] + lattice.slope[row] ** 2 * 0.01 + tau**2
+        b = lattice.nodes.field[row] + lattice.nodes.gradient[row] @ laid.rest[n]
+        tau = (
+            lattice.nodes.slope[row] * laid.moved[n] + laid.turned[n] + lattice.nodes.curvature[row]
+        )
+        s2 = 1.0 + lattice.nodes.variance[row] + lattice.nodes.slope[row] ** 2 * 0.01 + tau**2
         f = laid.field[n]
         if np.sum((f - b) ** 2) > (LARGEST + 1) * (s2 + TILT**2 * (f @ f + f[2] ** 2)):
             total += LARGEST + 1
@@ -114,7 +115,7 @@ def test_a_score_is_the_least_over_the_tilt(lattice: FieldLattice, seed: int) ->
     A, y = np.concatenate(rows), np.concatenate(rhs)
     tilt = np.linalg.lstsq(A, y)[0]
     total += float(np.sum((y - A @ tilt) ** 2))
-    found = score_at(lattice.at[node], nodes_of(lattice), laid, ANYTHING)
+    found = score_at(lattice.at[node], lattice.nodes, laid, ANYTHING)
     assert found == pytest.approx(total, rel=1e-9)
 
 
@@ -122,7 +123,7 @@ def test_a_score_beyond_the_limit_is_given_up(hall: SurveyedWorld, lattice: Fiel
     """Sums of the first readings only grow: what is given up early is what is beyond at the end."""
     rng = np.random.default_rng(3)
     laid = heading(pattern_at(hall, np.array([0.5, 0.2, 0.5]), 0.4, rng), STEP, 0.0, 0.1)
-    nodes, limit = nodes_of(lattice), 150.0
+    nodes, limit = lattice.nodes, 150.0
     for at in lattice.at[rng.choice(len(lattice), 300, replace=False)]:
         whole = score_at(at, nodes, laid, ANYTHING)
         part = score_at(at, nodes, laid, Rules(limit, 1000, TILT**2))
@@ -157,10 +158,12 @@ def test_a_lattice_knows_the_field_about_its_nodes(
     nodes = rng.choice(len(lattice), 2000)
     off = rng.uniform(-STEP / 2, STEP / 2, (len(nodes), 3))
     field, _ = hall.field_and_gradient(lattice.places(nodes) + off)
-    tangent = lattice.field[nodes] + np.einsum("nij,nj->ni", lattice.gradient[nodes], off)
+    tangent = lattice.nodes.field[nodes] + np.einsum(
+        "nij,nj->ni", lattice.nodes.gradient[nodes], off
+    )
     missed = np.linalg.norm(field - tangent, axis=1)
     # Neighbours are six directions; between them a field may bend a little more.
-    assert np.mean(missed <= lattice.curvature[nodes]) > 0.98
+    assert np.mean(missed <= lattice.nodes.curvature[nodes]) > 0.98
 
 
 def test_a_map_that_is_too_large_is_refused(hall: SurveyedWorld) -> None:
