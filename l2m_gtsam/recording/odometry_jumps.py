@@ -39,12 +39,15 @@ class JumpOptions(Options):
     """degrees."""
     acceleration_m_s2: float = Field(default=4.0, gt=0)
     """What the vehicle may accelerate by in m/s^2, over the time of the step and from there to its
-    neighbours,"""
+    neighbours; more where half of the drive does, as what is carried by hand may,"""
     acceleration_deg_s2: float = Field(default=300.0, gt=0)
-    """and how its turning may change in deg/s^2."""
+    """and how its turning may change in deg/s^2, likewise."""
     accelerations: float = Field(default=5.0, ge=1)
     """So many times what nearly all of the drive's own accelerations are within, where that is
     less; not over gaps."""
+    gaps: float = Field(default=2.0, ge=1)
+    """Over a gap of poses: so many times what the drive's own motion differs by from that around
+    it over as long a time, nearly always. A hand turns more suddenly than a vehicle."""
     scatter: float = Field(default=10.0, ge=1)
     """So many times what half of the drive's own steps differ by: the noise of the poses."""
 
@@ -226,7 +229,7 @@ def _jumps_among(trajectory: Trajectory, options: JumpOptions) -> _StepCompariso
     steps = _steps_of(trajectory)
     jumped = np.zeros(len(steps.seconds), dtype=np.bool_)
     for _ in range(ROUNDS):
-        found = _compared(steps, ~jumped, options)
+        found = _compared(trajectory, steps, ~jumped, options)
         if 2 * found.jumped.sum() >= len(found.jumped):  # no reference motion
             return replace(found, jumped=np.zeros_like(jumped))
         if np.array_equal(found.jumped, jumped):
@@ -235,8 +238,86 @@ def _jumps_among(trajectory: Trajectory, options: JumpOptions) -> _StepCompariso
     return found
 
 
-def _compared(steps: _Steps, good: BoolArray, options: JumpOptions) -> _StepComparison:
+def _compared(
+    trajectory: Trajectory, steps: _Steps, good: BoolArray, options: JumpOptions
+) -> _StepComparison:
     """Compare steps with their good neighbours."""
+    motion = _motion_about(steps, good)
+    reach, changes = steps.seconds * motion.away, _changes(steps, good)
+    # Mean squares per axis.
+    acceleration = np.asarray(np.mean(changes**2, axis=0) / AXES)
+    found = _StepComparison(motion.R, motion.t, motion.off, reach, acceleration, good)
+    sizes = found.sizes()
+    limits = np.maximum(
+        np.array([np.deg2rad(options.rotation_deg), options.position_m]),
+        options.scatter * np.median(sizes, axis=0),
+    )
+    most = np.array([np.deg2rad(options.acceleration_deg_s2), options.acceleration_m_s2])
+    half, own = np.quantile(changes, [0.5, USUAL], axis=0)
+    within = np.minimum(np.maximum(most, half), options.accelerations * own)
+    gap = steps.seconds > GAP * np.median(steps.seconds)  # in which the vehicle may have stopped
+    limits = np.maximum(limits, reach[:, None] * np.where(gap[:, None], most, within))
+    for row in np.flatnonzero(gap & np.any(sizes > limits, axis=1)).tolist():
+        own = options.gaps * _own_motion(trajectory, good, steps.seconds[row])
+        limits[row] = np.maximum(limits[row], own)
+    return replace(found, jumped=np.any(sizes > limits, axis=1))
+
+
+def _own_motion(trajectory: Trajectory, good: BoolArray, seconds: float) -> FloatArray:
+    """Return what nearly all of a drive's motion over a time differs by from that around it.
+
+    Poses are left out, as in a gap, wherever the drive has them.
+
+    Parameters
+    ----------
+    trajectory
+        N poses.
+    good
+        Which steps between them are no jumps, shape (N - 1,).
+    seconds
+        The time.
+
+    Returns
+    -------
+    Radians and metres, shape (2,); 0 where the drive is nowhere long enough.
+    """
+    period = np.median(np.diff(trajectory.stamp_ns)) * 1e-9
+    count = max(round(seconds / period), 1)
+    place = np.arange(len(trajectory)) % (count + NEIGHBOURS)
+    kept = np.flatnonzero((place == 0) | (place >= count))
+    part = trajectory[kept]
+    wrong = np.diff(np.append(0, np.cumsum(~good))[kept]) > 0
+    steps = _steps_of(part)
+    lasting = np.abs(steps.seconds - seconds) < 0.5 * seconds
+    chosen = lasting & (np.diff(kept) == count) & ~wrong
+    if not chosen.any():
+        return np.zeros(2)
+    off = _motion_about(steps, ~wrong).off[chosen]
+    sizes = np.linalg.norm(off.reshape(-1, 2, AXES), axis=2)
+    return np.asarray(np.quantile(sizes, USUAL, axis=0))
+
+
+@dataclass(frozen=True)
+class _MotionAbout:
+    """The motion of good steps about each of N steps, as that of the step.
+
+    Attributes
+    ----------
+    R, t
+        The pose after in the frame of the pose before, (N, 3, 3) and (N, 3), metres.
+    off
+        What the steps differ from it by: rotation vector in rad and translation in m, (N, 6).
+    away
+        Time from each step to the good ones, seconds, shape (N,).
+    """
+
+    R: FloatArray
+    t: FloatArray
+    off: FloatArray
+    away: FloatArray
+
+
+def _motion_about(steps: _Steps, good: BoolArray) -> _MotionAbout:
     velocity, away = _about(steps, good)
     expected = velocity * steps.seconds[:, None]
     turn = Rotation.from_rotvec(expected[:, :3])
@@ -245,22 +326,7 @@ def _compared(steps: _Steps, good: BoolArray, options: JumpOptions) -> _StepComp
         [(turn.inv() * Rotation.from_rotvec(steps.turn)).as_rotvec(), steps.shift - shift]
     )
     off[:, 3:] = turn.inv().apply(off[:, 3:])
-    reach, changes = steps.seconds * away, _changes(steps, good)
-    # Mean squares per axis.
-    acceleration = np.asarray(np.mean(changes**2, axis=0) / AXES)
-    found = _StepComparison(turn.as_matrix(), shift, off, reach, acceleration, good)
-    sizes = found.sizes()
-    limits = np.maximum(
-        np.array([np.deg2rad(options.rotation_deg), options.position_m]),
-        options.scatter * np.median(sizes, axis=0),
-    )
-    most = np.array([np.deg2rad(options.acceleration_deg_s2), options.acceleration_m_s2])
-    own = options.accelerations * np.quantile(changes, USUAL, axis=0)
-    gap = steps.seconds > GAP * np.median(steps.seconds)  # in which the vehicle may have stopped
-    limits = np.maximum(
-        limits, reach[:, None] * np.where(gap[:, None], most, np.minimum(most, own))
-    )
-    return replace(found, jumped=np.any(sizes > limits, axis=1))
+    return _MotionAbout(turn.as_matrix(), shift, off, away)
 
 
 def _about(steps: _Steps, good: BoolArray) -> tuple[FloatArray, FloatArray]:

@@ -20,7 +20,7 @@ from l2m_gtsam.data import (
     joined_rows,
 )
 from l2m_gtsam.errors import SyncError
-from l2m_gtsam.geometry import interpolated_rotations
+from l2m_gtsam.geometry import interpolated_rotations, turn_angle
 from l2m_gtsam.options import Options
 from l2m_gtsam.recording.saturation import is_saturated, saturated_axes
 
@@ -29,8 +29,8 @@ class SyncOptions(Options):
     """How readings get their poses and which of them are kept."""
 
     max_pose_gap_s: float = Field(default=0.5, gt=0)
-    """Readings between two poses further apart than this are dropped; poses are never
-    extrapolated."""
+    """Readings between two poses further apart than this are dropped, as are those between two
+    that differ by a turn of more than 45 degrees; poses are never extrapolated."""
     thin_distance_m: float = Field(default=0.02, ge=0)
     """Of readings whose poses fall into one cell of this size (and of `thin_angle_deg`) the first
     is kept: a parked vehicle adds no information about the map. 0 does not look at the place."""
@@ -40,6 +40,9 @@ class SyncOptions(Options):
 
 # Readings that vary less than this are stuck: a moving magnetometer's noise alone is larger.
 STUCK_UT = 1e-3
+# Between two poses the body is taken to turn steadily: if it begins or ends at rest, that is wrong
+# by up to a quarter of the turn.
+MOST_TURN_DEG = 45.0
 # Velocities are taken over this time: between two poses their noise would be a large part.
 TWIST_S = 0.1
 # And accelerations over this: to either side a period of poses at 10 Hz, between which they are
@@ -89,8 +92,7 @@ def _synchronise_one(
     finite = np.asarray(np.isfinite(series.field).all(axis=1))
     repeated = _repeated(series.stamp_ns, finite)
     spanned = _spanned(trajectory.stamp_ns, series.stamp_ns, around_ns)
-    gap = longest_gap_ns(trajectory.stamp_ns, series.stamp_ns, around_ns)
-    near = gap <= options.max_pose_gap_s * 1e9
+    near = _between_near_poses(trajectory, series.stamp_ns, options.max_pose_gap_s, around_ns)
     fresh = finite & ~repeated
     keep = fresh & spanned & near
     readings = _with_poses(trajectory, index, series.stamp_ns[keep], series.field[keep])
@@ -150,11 +152,14 @@ def longest_gap_ns(pose_ns: IntArray, stamp_ns: IntArray, around_ns: int = 0) ->
     """Return the longest time between two poses around each reading, 0 on a pose."""
     if len(pose_ns) < 2:
         return np.zeros(len(stamp_ns), dtype=np.int64)
-    # The brackets that the time around a reading touches: from one pose to another.
+    return longest_between(np.diff(pose_ns), *_touched(pose_ns, stamp_ns, around_ns))
+
+
+def _touched(pose_ns: IntArray, stamp_ns: IntArray, around_ns: int) -> tuple[IntArray, IntArray]:
+    """Return the numbers of the poses before and after the time around each reading."""
     before = np.searchsorted(pose_ns, stamp_ns - around_ns, side="right") - 1
     after = np.searchsorted(pose_ns, stamp_ns + around_ns, side="left")
-    before, after = np.maximum(before, 0), np.minimum(after, len(pose_ns) - 1)
-    return longest_between(np.diff(pose_ns), before, after)
+    return np.maximum(before, 0), np.minimum(after, len(pose_ns) - 1)
 
 
 def longest_between(gap: IntArray, first: IntArray, last: IntArray) -> IntArray:
@@ -210,6 +215,19 @@ def has_pose(trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float) 
     """Return which times lie between two poses that are not further apart, shape (N,)."""
     spanned = _spanned(trajectory.stamp_ns, stamp_ns, 0)
     return spanned & (longest_gap_ns(trajectory.stamp_ns, stamp_ns) <= max_pose_gap_s * 1e9)
+
+
+def _between_near_poses(
+    trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float, around_ns: int
+) -> BoolArray:
+    """Return whether poses around each reading are near enough to be interpolated, shape (N,)."""
+    longest = longest_gap_ns(trajectory.stamp_ns, stamp_ns, around_ns)
+    near, R = np.asarray(longest <= max_pose_gap_s * 1e9), trajectory.R
+    far = turn_angle(R[:-1].transpose(0, 2, 1) @ R[1:]) > np.deg2rad(MOST_TURN_DEG)
+    if far.any():
+        touched = _touched(trajectory.stamp_ns, stamp_ns, around_ns)
+        near &= longest_between(far.astype(np.int64), *touched) == 0
+    return near
 
 
 def interpolated(trajectory: Trajectory, stamp_ns: IntArray) -> Trajectory:

@@ -1,7 +1,7 @@
 """The verdict on a calibration: PASS, WARN or FAIL, with reasons in plain sentences."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +47,7 @@ COMMON = (
 )
 Rule = Callable[[Case], list[Reason]]
 MANY = 4  # stretches that are listed one by one
+SURE = 5.0  # times what a uniform field leaves: a jump so large is no error of the map
 
 
 def judge(result: CalibrationResult, metrics: Measures, options: QaOptions) -> Verdict:
@@ -227,6 +228,18 @@ def _own_disturbances(case: Case) -> list[Reason]:
     return [*jump_reasons(case.result, sensor), *disturbance_reasons(case.result, sensor)]
 
 
+def _large_jumps(case: Case) -> list[Reason]:
+    """Return the jumps of its H that no map can make up.
+
+    With H as it was then a field that is the same everywhere leaves less.
+    """
+    if case.metrics is None:
+        return []
+    least = case.metrics.fit.without_map
+    jumps = [each for each in case.result.jumps if np.linalg.norm(each.change) > SURE * least]
+    return jump_reasons(replace(case.result, jumps=tuple(jumps)), case.sensor.sensor)
+
+
 def _stated(case: Case) -> list[Reason]:
     """Return what was stated of this sensor that its readings speak against."""
     return stated_wrongly(case.result.stated, case.sensor.sensor, None)
@@ -293,7 +306,7 @@ RULES = (
     _stated,
     _lower_bounds,
 )
-RULES_OF_A_MISFIT = (saturation, fit, ending)
+RULES_OF_A_MISFIT = (saturation, fit, ending, _large_jumps)
 RULES_OF_A_MOVED = (saturation, repeat, ending)
 # What may keep a solve from converging: named before that.
 CAUSES = (saturation, _own_stretches, repeat, fit)

@@ -14,6 +14,7 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP
 from l2m_gtsam.records.calibration import SensorStatus
+from l2m_gtsam.records.error_budget import OffsetJump
 from l2m_gtsam.records.verdict import Level, Verdict
 from tests.drives.degenerate import PLACES, STRONG, eight, recorded
 from tests.drives.verdict import EIGHT, drive
@@ -67,6 +68,21 @@ def test_a_map_of_another_place_is_named_in_a_report() -> None:
     for sensor in found.result.sensors:
         first = verdict[sensor.sensor].reasons[0].text
         assert "the map does not fit this drive" in first
+
+
+@pytest.mark.parametrize(("change_ut", "is_told"), [(400.0, True), (2.0, False)])
+def test_a_jump_that_no_map_makes_up_is_told_beside_a_map_that_does_not_fit(
+    change_ut: float, is_told: bool
+) -> None:
+    """A magnet beside the sensor, in a map that may be of elsewhere: both are told."""
+    whole = drive()
+    found = calibrated(whole.recording, hall(dipole_world(5)), CalibrationOptions())
+    jump = OffsetJump("mag_0", 53_600_000_000, 12.0, (0.0, change_ut, 0.0), (0.1, 0.1, 0.1))
+    jumped = replace(found, result=replace(found.result, jumps=(jump,)))
+    first, *others = verdict_on(whole.recording, jumped, CalibrationOptions())["mag_0"].reasons
+    assert "the map does not fit this drive" in first.text
+    told = "12 s after the first reading that counts (stamp 53.60 s) its offset H jumped by 400 µT"
+    assert any(each.text.startswith(told) for each in others) is is_told
 
 
 def test_a_short_drive_is_named_with_its_remedy_alone() -> None:

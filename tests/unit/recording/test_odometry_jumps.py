@@ -152,6 +152,34 @@ def test_a_pose_that_lies_elsewhere_is_left_out() -> None:
     assert note.endswith("are left out: 1")
 
 
+def carried_by_hand(seconds: float) -> Trajectory:
+    """Poses at 20 Hz of what a hand turns to and fro, by up to 390 deg/s and 2500 deg/s^2."""
+    at = np.arange(0, seconds, 0.05)
+    turns = np.column_stack([np.sin(6.1 * at), 0.9 * np.sin(5.3 * at + 1), np.sin(4.7 * at + 2)])
+    p = 0.2 * np.column_stack([np.sin(2.1 * at), np.sin(1.7 * at + 1), 0.5 * np.sin(2.9 * at)])
+    R = Rotation.from_rotvec(turns).as_matrix()
+    return Trajectory(np.round(1e9 * at).astype(np.int64), R, p, "map", "lidar")
+
+
+@pytest.mark.parametrize("lost", [2, 4, 6])
+def test_a_hand_turns_as_suddenly_in_a_gap_as_elsewhere(lost: int) -> None:
+    """Tracking that is lost for 0.15 to 0.35 s, in 30 places: steps over it are as recorded."""
+    drive = carried_by_hand(120)
+    gone = np.concatenate([k + np.arange(lost) for k in range(60, 2300, 75)])
+    with_gaps = drive[np.setdiff1d(np.arange(len(drive)), gone)]
+    assert without_jumps(with_gaps, OPTIONS).jumps == ()
+    vehicle = OPTIONS.model_copy(update={"gaps": 1e-6})
+    assert without_jumps(with_gaps, vehicle).jumps  # by what a vehicle does they would be jumps
+
+
+def test_a_jump_in_a_gap_of_a_hand_is_found() -> None:
+    drive = carried_by_hand(120)
+    away = jumped(drive, shift(1000, 3.0, 0.0))
+    away = away[np.setdiff1d(np.arange(len(away)), 998 + np.arange(6))]
+    (jump,) = without_jumps(away, OPTIONS).jumps
+    assert jump.distance_m == pytest.approx(3.0, abs=0.4)  # of the hand's own way meanwhile
+
+
 def test_a_gap_is_no_jump() -> None:
     """Two seconds without odometry while the vehicle goes on, stops, or turns."""
     kept = np.r_[0:200, 240 : len(DRIVE)]

@@ -53,6 +53,20 @@ def test_everything_dropped_is_counted() -> None:
     assert (counts.in_pose_gap, counts.thinned, counts.kept) == (1, 0, 5)
 
 
+def test_readings_between_poses_that_turn_far_are_dropped() -> None:
+    """Who turns by 90 degrees in 0.4 s from rest has turned by 22, not 45, after half of it."""
+    poses = turning_drive(np.arange(0, 3, 0.1))
+    turned = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
+    R = np.where(np.arange(len(poses))[:, None, None] >= 20, poses.R @ turned, poses.R)
+    rows = np.setdiff1d(np.arange(len(poses)), np.arange(17, 20))
+    stamps = np.array([1.0, 1.55, 1.65, 1.9, 2.05])
+    sudden = replace(poses, R=R)[rows]
+    found = synchronise(recording(sudden, series(stamps)), KEEP_ALL)
+    assert (found.counts[0].in_pose_gap, found.counts[0].kept) == (2, 3)
+    around = synchronise(recording(sudden, series(stamps)), KEEP_ALL, largest_offset_s=0.1)
+    assert (around.counts[0].in_pose_gap, around.counts[0].kept) == (4, 1)
+
+
 def test_repeated_stamps_are_counted_and_the_finite_one_is_kept() -> None:
     poses = turning_drive(np.arange(0, 3, 0.1))
     stamps = np.array([0.5, 0.5, 0.5, 1.0, 1.0])
