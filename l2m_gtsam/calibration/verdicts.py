@@ -285,8 +285,9 @@ def _unsolved(
         )
     else:
         status = SensorStatus.OUTSIDE_MAP
-        message = f"{outside} of {usable} readings lie outside the map, "
-        message += f"at least {needed} must lie inside"
+        message = (
+            f"{outside} of {usable} readings lie outside the map, at least {needed} must lie inside"
+        )
     rotation = _no_rotation()
     return SensorCalibration(
         sensor=name,
