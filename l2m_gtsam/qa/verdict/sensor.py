@@ -33,7 +33,8 @@ HEADS = {
 WORSE = 1.5  # of what a uniform field leaves of the readings: the map contradicts them
 WRONG_MAP = (
     "The map does not fit this drive: a field that is the same everywhere explains the readings as "
-    "well. Is it the map of this place, and are the poses in its frame?"
+    "well. Is it the map of this place, and are the poses in its frame? (Or the field here is too "
+    "uniform, beside the sensors' noise, to test the map.)"
 )
 
 
