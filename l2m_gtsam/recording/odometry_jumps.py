@@ -23,6 +23,7 @@ ROUNDS = 20  # limit of detections without the jumps found before: a few are nee
 MAX_REPORTED = 3  # jumps that are reported one by one
 AXES = 3
 GAP = 2.0  # times the usual time of a step
+GRADES = 4  # of lengths of gaps, for each doubling
 USUAL = 0.98  # share of a drive's accelerations; jumps are among the others
 
 
@@ -257,13 +258,18 @@ def _compared(
     within = np.minimum(np.maximum(most, half), options.accelerations * own)
     gap = steps.seconds > GAP * np.median(steps.seconds)  # in which the vehicle may have stopped
     limits = np.maximum(limits, reach[:, None] * np.where(gap[:, None], most, within))
-    for row in np.flatnonzero(gap & np.any(sizes > limits, axis=1)).tolist():
-        own = options.gaps * _own_motion(trajectory, good, steps.seconds[row])
-        limits[row] = np.maximum(limits[row], own)
+    suspect = np.flatnonzero(gap & np.any(sizes > limits, axis=1))
+    period = float(np.median(steps.seconds))
+    # About so many periods: gaps of much the same length are compared with the same motion.
+    lost = np.exp2(np.ceil(GRADES * np.log2(steps.seconds[suspect] / period)) / GRADES)
+    for periods in np.unique(lost).tolist():
+        rows = suspect[lost == periods]
+        own = options.gaps * _own_motion(trajectory, good, round(periods), period)
+        limits[rows] = np.maximum(limits[rows], own)
     return replace(found, jumped=np.any(sizes > limits, axis=1))
 
 
-def _own_motion(trajectory: Trajectory, good: BoolArray, seconds: float) -> FloatArray:
+def _own_motion(trajectory: Trajectory, good: BoolArray, count: int, period: float) -> FloatArray:
     """Return what nearly all of a drive's motion over a time differs by from that around it.
 
     Poses are left out, as in a gap, wherever the drive has them.
@@ -274,21 +280,19 @@ def _own_motion(trajectory: Trajectory, good: BoolArray, seconds: float) -> Floa
         N poses.
     good
         Which steps between them are no jumps, shape (N - 1,).
-    seconds
-        The time.
+    count, period
+        So many usual times of a step, and that time in seconds.
 
     Returns
     -------
     Radians and metres, shape (2,); 0 where the drive is nowhere long enough.
     """
-    period = np.median(np.diff(trajectory.stamp_ns)) * 1e-9
-    count = max(round(seconds / period), 1)
     place = np.arange(len(trajectory)) % (count + NEIGHBOURS)
     kept = np.flatnonzero((place == 0) | (place >= count))
     part = trajectory[kept]
     wrong = np.diff(np.append(0, np.cumsum(~good))[kept]) > 0
     steps = _steps_of(part)
-    lasting = np.abs(steps.seconds - seconds) < 0.5 * seconds
+    lasting = np.abs(steps.seconds - count * period) < 0.5 * count * period
     chosen = lasting & (np.diff(kept) == count) & ~wrong
     if not chosen.any():
         return np.zeros(2)
