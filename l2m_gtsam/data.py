@@ -573,6 +573,12 @@ class KnownSensor:
         """Return a sensor without distortion at the lidar's origin."""
         return cls(sensor, np.zeros(3), Distortion.identity())
 
+    @property
+    def is_ideal(self) -> bool:
+        """Whether nothing is known of it: no distortion, at the lidar's origin, no sigmas."""
+        ideal = KnownSensor.ideal(self.sensor).vector()
+        return self.covariance is None and np.array_equal(self.vector(), ideal)
+
     def vector(self) -> FloatArray:
         """Return (t, C row by row, H) in m, 1 and uT, shape (15,)."""
         return np.concatenate([self.t_lidar_mag, self.distortion.vector()])

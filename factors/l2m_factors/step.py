@@ -1,9 +1,8 @@
 r"""Steps of odometry: between key poses, along fixed axes, with a steady drift, and at readings.
 
-Readings between two key poses: what the error of odometry's step adds to them.
-
-A reading after a share s of the step from ``X(k)`` to ``X(k+1)`` stands at ``X(k) (R, p)`` if the
-step is Z. With ``d = Log(Z^{-1} X(k)^{-1} X(k+1))`` it stands elsewhere by ``s d``, and
+**At readings.** What the error of a step adds to the readings between its two key poses. A reading
+after a share s of the step from ``X(k)`` to ``X(k+1)`` stands at ``X(k) (R, p)`` if the step is Z.
+With ``d = Log(Z^{-1} X(k)^{-1} X(k+1))`` it stands elsewhere by ``s d``, and
 
 .. math::
     e = e(X(k)) + G d
@@ -11,20 +10,17 @@ step is Z. With ``d = Log(Z^{-1} X(k)^{-1} X(k+1))`` it stands elsewhere by ``s 
 with G the derivative of the residual by d where the graph is linearised. For the best result
 readings are hung anew, by the step as it is estimated then; there d is zero, and e is exact.
 
-A step of odometry that is measured along fixed axes, whatever the attitude is.
-
-A vehicle that measures its way and its turns against fixed axes, such as a ship by beacons, turns
-no step and no later turn by an error of its attitude. With the turn R and the way d along the axes
-of the frame of the poses
+**Along fixed axes**, whatever the attitude is. A vehicle that measures its way and its turns
+against fixed axes, such as a ship by beacons, turns no step and no later turn by an error of its
+attitude. With the turn R and the way d along the axes of the frame of the poses
 
 .. math::
     e = [Log(R_k^T R^T R_{k+1}), R_{k+1}^T (p_{k+1} - p_k - d)]
 
-Steps of an odometry that drifts steadily: by a current, wind or a slope, or by turning.
-
-What is added to each step is ``W_k v`` along the axes of the frame of the poses, with v common to
-all steps: the turn ``u_k``, about one axis as by a gyroscope's bias or by unequal wheels, and the
-way ``s_k``. With the turn R and the way p of a step along the axes of the vehicle
+**With a steady drift**: by a current, wind or a slope, or by turning. What is added to each step is
+``W_k v`` along the axes of the frame of the poses, with v common to all steps: the turn ``u_k``,
+about one axis as by a gyroscope's bias or by unequal wheels, and the way ``s_k``. With the turn R
+and the way p of a step along the axes of the vehicle
 
 .. math::
     e = Log(Z^{-1} X_k^{-1} X_{k+1}), \quad Z = (Exp(-R_k^T u_k) R, p - R_k^T s_k)

@@ -317,7 +317,8 @@ def _why_silent(usable: int, counts: SyncCounts, moved: Movement, needed: int) -
     return (
         f"{reason}{usable} usable readings of {counts.received} received "
         f"({counts.not_finite} not finite, {counts.repeated} repeated, "
-        f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap between poses, "
+        f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap or a "
+        f"far turn between poses, "
         f"{counts.thinned} at a place already read{numbers}{beyond}), at least {needed} "
         f"are needed: {remedy}"
     )
@@ -332,7 +333,7 @@ def _remedy(counts: SyncCounts, moved: Movement, needed: int) -> str:
     lost = {
         "check the sensor and its driver": counts.not_finite + counts.repeated,
         "record poses over the whole drive": counts.outside_trajectory,
-        "record poses without gaps": counts.in_pose_gap,
+        "record poses without gaps, and more often where it turns fast": counts.in_pose_gap,
         "drive on, through more places": counts.thinned,
         "record the number over the whole drive": counts.without_regressor,
         "choose a larger range, or keep the vehicle's iron away": counts.saturated,

@@ -113,7 +113,8 @@ def map_of(
         field_map = field_map.doubted((*steady.doubts, *read.doubts))
     # Errors that are stated or found are counted; sensors that count as exact have to look like it,
     # and so do those of which nothing is known: what is found of them may be the least part.
-    if isinstance(field_map, HarmonicMap) and (suite is None or field_map.learnt.suite is None):
+    unknown = suite is None or all(each.is_ideal for each in suite.values())
+    if isinstance(field_map, HarmonicMap) and (unknown or field_map.learnt.suite is None):
         return field_map.doubted(suite_doubts(recordings, suite, options.suite))
     return field_map
 

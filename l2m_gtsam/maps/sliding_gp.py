@@ -5,7 +5,7 @@ partitioned into blocks, and each is interpolated by a Gaussian process over the
 and in a margin around it. All blocks share hyperparameters and prior mean, so that the map tends
 to the dense process as the margin grows.
 
-Posterior means of Gaussian processes on blocks, point by point; see ``posterior``.
+Posterior means are computed point by point (``posterior``, one length scale):
 
     mean_i     = sum_j k_j alpha_ji,    k_j = exp(-|x - y_j|^2 / 2)
     dmean_i/dx = -(1/l) sum_j (x - y_j) k_j alpha_ji

@@ -47,8 +47,8 @@ class JumpOptions(Options):
     """So many times what nearly all of the drive's own accelerations are within, where that is
     less; not over gaps."""
     gaps: float = Field(default=2.0, ge=1)
-    """Over a gap of poses: so many times what the drive's own motion differs by from that around
-    it over as long a time, nearly always. A hand turns more suddenly than a vehicle."""
+    """Over a gap of poses, off line: so many times what the drive's own motion differs by from that
+    around it over as long a time, nearly always. A hand turns more suddenly than a vehicle."""
     scatter: float = Field(default=10.0, ge=1)
     """So many times what half of the drive's own steps differ by: the noise of the poses."""
 
@@ -229,8 +229,11 @@ def _jumps_among(trajectory: Trajectory, options: JumpOptions) -> _StepCompariso
     """Detect jumps, repeated without those found before until they are the same."""
     steps = _steps_of(trajectory)
     jumped = np.zeros(len(steps.seconds), dtype=np.bool_)
+    # Once: with what is found later the drive's own motion would depend on what it decides.
+    first = _compared(steps, ~jumped, options).jumped
+    usual = _usual_over_gaps(trajectory, steps, first, options)
     for _ in range(ROUNDS):
-        found = _compared(trajectory, steps, ~jumped, options)
+        found = _compared(steps, ~jumped, options, usual)
         if 2 * found.jumped.sum() >= len(found.jumped):  # no reference motion
             return replace(found, jumped=np.zeros_like(jumped))
         if np.array_equal(found.jumped, jumped):
@@ -240,9 +243,9 @@ def _jumps_among(trajectory: Trajectory, options: JumpOptions) -> _StepCompariso
 
 
 def _compared(
-    trajectory: Trajectory, steps: _Steps, good: BoolArray, options: JumpOptions
+    steps: _Steps, good: BoolArray, options: JumpOptions, usual: FloatArray | float = 0.0
 ) -> _StepComparison:
-    """Compare steps with their good neighbours."""
+    """Compare N steps with their good neighbours; ``usual`` never is a jump, shape (N, 2)."""
     motion = _motion_about(steps, good)
     reach, changes = steps.seconds * motion.away, _changes(steps, good)
     # Mean squares per axis.
@@ -258,15 +261,36 @@ def _compared(
     within = np.minimum(np.maximum(most, half), options.accelerations * own)
     gap = steps.seconds > GAP * np.median(steps.seconds)  # in which the vehicle may have stopped
     limits = np.maximum(limits, reach[:, None] * np.where(gap[:, None], most, within))
-    suspect = np.flatnonzero(gap & np.any(sizes > limits, axis=1))
-    period = float(np.median(steps.seconds))
+    return replace(found, jumped=np.any(sizes > np.maximum(limits, usual), axis=1))
+
+
+def _usual_over_gaps(
+    trajectory: Trajectory, steps: _Steps, jumped: BoolArray, options: JumpOptions
+) -> FloatArray:
+    """Return what a drive's own motion may differ by over each of its gaps that looks like a jump.
+
+    Parameters
+    ----------
+    trajectory, steps
+        N poses, and the steps between them.
+    jumped
+        Which steps look like jumps, shape (N - 1,).
+    options
+        What is a jump.
+
+    Returns
+    -------
+    Radians and metres, shape (N - 1, 2); 0 for all other steps.
+    """
+    usual, period = np.zeros((len(jumped), 2)), float(np.median(steps.seconds))
+    gap = steps.seconds > GAP * period
+    suspect = np.flatnonzero(gap & jumped)
     # About so many periods: gaps of much the same length are compared with the same motion.
     lost = np.exp2(np.ceil(GRADES * np.log2(steps.seconds[suspect] / period)) / GRADES)
     for periods in np.unique(lost).tolist():
-        rows = suspect[lost == periods]
-        own = options.gaps * _own_motion(trajectory, good, round(periods), period)
-        limits[rows] = np.maximum(limits[rows], own)
-    return replace(found, jumped=np.any(sizes > limits, axis=1))
+        own = _own_motion(trajectory, ~(gap | jumped), round(periods), period)
+        usual[suspect[lost == periods]] = options.gaps * own
+    return usual
 
 
 def _own_motion(trajectory: Trajectory, good: BoolArray, count: int, period: float) -> FloatArray:
@@ -279,7 +303,7 @@ def _own_motion(trajectory: Trajectory, good: BoolArray, count: int, period: flo
     trajectory
         N poses.
     good
-        Which steps between them are no jumps, shape (N - 1,).
+        Which steps between them are neither gaps nor like jumps, shape (N - 1,).
     count, period
         So many usual times of a step, and that time in seconds.
 
@@ -298,7 +322,8 @@ def _own_motion(trajectory: Trajectory, good: BoolArray, count: int, period: flo
         return np.zeros(2)
     off = _motion_about(steps, ~wrong).off[chosen]
     sizes = np.linalg.norm(off.reshape(-1, 2, AXES), axis=2)
-    return np.asarray(np.quantile(sizes, USUAL, axis=0))
+    largest = np.quantile(sizes, USUAL, axis=0)
+    return np.asarray(np.nan_to_num(largest))  # NaN without neighbours
 
 
 @dataclass(frozen=True)

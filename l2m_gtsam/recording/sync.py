@@ -92,7 +92,7 @@ def _synchronise_one(
     finite = np.asarray(np.isfinite(series.field).all(axis=1))
     repeated = _repeated(series.stamp_ns, finite)
     spanned = _spanned(trajectory.stamp_ns, series.stamp_ns, around_ns)
-    near = _between_near_poses(trajectory, series.stamp_ns, options.max_pose_gap_s, around_ns)
+    near = between_near_poses(trajectory, series.stamp_ns, options.max_pose_gap_s, around_ns)
     fresh = finite & ~repeated
     keep = fresh & spanned & near
     readings = _with_poses(trajectory, index, series.stamp_ns[keep], series.field[keep])
@@ -217,10 +217,22 @@ def has_pose(trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float) 
     return spanned & (longest_gap_ns(trajectory.stamp_ns, stamp_ns) <= max_pose_gap_s * 1e9)
 
 
-def _between_near_poses(
-    trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float, around_ns: int
+def between_near_poses(
+    trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float, around_ns: int = 0
 ) -> BoolArray:
-    """Return whether poses around each reading are near enough to be interpolated, shape (N,)."""
+    """Return whether poses around each reading are near enough to be interpolated, shape (N,).
+
+    Parameters
+    ----------
+    trajectory
+        Poses.
+    stamp_ns
+        Times of N readings, within those of the poses.
+    max_pose_gap_s
+        Longest time between two poses that are near.
+    around_ns
+        Poses are near for so long before and after a reading, too.
+    """
     longest = longest_gap_ns(trajectory.stamp_ns, stamp_ns, around_ns)
     near, R = np.asarray(longest <= max_pose_gap_s * 1e9), trajectory.R
     far = turn_angle(R[:-1].transpose(0, 2, 1) @ R[1:]) > np.deg2rad(MOST_TURN_DEG)
@@ -312,5 +324,6 @@ def _nothing_left(recording: Recording, options: SyncOptions, largest_offset_s: 
     return (
         f"{recording.source.path}: no finite reading has a pose: readings run from {span}, poses "
         f"from {poses}, and poses may be {options.max_pose_gap_s:g} s apart at most{around} "
-        f"(`max_pose_gap_s`); if their clocks differ, {remedy}"
+        f"(`max_pose_gap_s`) and turn by {MOST_TURN_DEG:g} degrees at most from one to the next; "
+        f"if their clocks differ, {remedy}"
     )

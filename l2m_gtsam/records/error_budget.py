@@ -119,8 +119,8 @@ class OffsetChange(Record):
     sensor
         Of which.
     stamp_ns, seconds
-        Of a jump when it is: by its stamps, and after the first reading of the drive. Of a drift
-        when the drive begins, and how long it is.
+        Of a jump when it is: by its stamps, and after the first reading of the drive that counts.
+        Of a drift when the drive begins, and how long it is.
     change, sigma
         H after less before, or at the end less at the beginning, and its standard deviation, uT.
     """

@@ -231,7 +231,7 @@ def _own_disturbances(case: Case) -> list[Reason]:
 def _large_jumps(case: Case) -> list[Reason]:
     """Return the jumps of its H that no map can make up.
 
-    With H as it was then a field that is the same everywhere leaves less.
+    A uniform field leaves much less of the readings, once the jumps are taken off.
     """
     if case.metrics is None:
         return []

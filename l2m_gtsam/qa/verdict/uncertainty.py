@@ -182,8 +182,8 @@ def jump_sentence(jump: OffsetJump) -> str:
     parts = ", ".join(map(with_sigma, jump.change, jump.sigma))
     drive = f" of {Path(jump.bag).name}" if jump.bag else ""
     return (
-        f"{jump.seconds:.0f} s after the first reading that counts{drive} (stamp "
-        f"{1e-9 * jump.stamp_ns:.2f} s) its offset H jumped by {size} µT: ({parts}) "
+        f"At stamp {1e-9 * jump.stamp_ns:.2f} s{drive}, {jump.seconds:.0f} s after the first "
+        f"reading that counts, its offset H jumped by {size} µT: ({parts}) "
         "µT along its x, y, z: something magnetic was laid near it, taken away or switched."
     )
 

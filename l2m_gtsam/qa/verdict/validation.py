@@ -120,9 +120,9 @@ def _jumped(drive: DriveValidation, sensor: ValidatedSensor, options: QaOptions)
     sigma = np.linalg.norm([each.sigma for each in own], axis=0)
     whole = change_of(CalibrationPart.OFFSET, change, sigma, 0.0)
     text = (
-        f"From {own[0].seconds:.0f} to {own[-1].seconds:.0f} s after the first reading that counts "
-        f"its offset H wanders, by {by_how_much(whole)} in all: the sensor warms up, or something "
-        "moves near it. Other changes of it may be of that."
+        f"From {own[0].seconds:.0f} to {own[-1].seconds:.0f} s after the first reading that "
+        f"counts, its offset H wanders, by {by_how_much(whole)} in all: the sensor warms up, or "
+        "something moves near it. Other changes of it may be of that."
     )
     return [Reason(limit.level(whole.size), text)]
 

@@ -172,7 +172,9 @@ def test_a_jump_of_H_is_timed_sized_and_taken_off() -> None:
     assert found.result.sources == ()
     assert max(distances(found, truth)) < WITHIN
     assert verdict.level is Level.WARN
-    assert said_of(verdict, "mag_00", " s) its offset H jumped by 2.0 µT")
+    assert said_of(
+        verdict, "mag_00", "s after the first reading that counts, its offset H jumped by 2.0 µT"
+    )
 
 
 def test_an_H_that_walks_does_not_jump() -> None:

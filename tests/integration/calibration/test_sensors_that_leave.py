@@ -81,7 +81,7 @@ def test_a_jump_that_no_map_makes_up_is_told_beside_a_map_that_does_not_fit(
     jumped = replace(found, result=replace(found.result, jumps=(jump,)))
     first, *others = verdict_on(whole.recording, jumped, CalibrationOptions())["mag_0"].reasons
     assert "the map does not fit this drive" in first.text
-    told = "12 s after the first reading that counts (stamp 53.60 s) its offset H jumped by 400 µT"
+    told = "At stamp 53.60 s, 12 s after the first reading that counts, its offset H jumped by 400"
     assert any(each.text.startswith(told) for each in others) is is_told
 
 

@@ -5,13 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.data import Distortion, KnownSensor, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import suite_readings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite, suite_doubts
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
+from l2m_gtsam.upkeep.surveys import map_surveys
 from tests.drives.slam import slam_drive
 from tests.drives.suite_surveys import CLOCK, QUICK, errors, suite, surveyed
 from tests.worlds.surveyed import strange_hall, wandering
@@ -73,6 +76,18 @@ def test_sensors_that_are_not_as_assumed_are_noticed(
     (doubt,) = suite_doubts([recording], off, QUICK)
     assert "mag_00, H" in doubt
     assert "l2m map suite" in doubt
+
+
+def test_a_map_of_ideal_sensors_says_that_they_are_not(
+    found: tuple[tuple[KnownSensor, ...], Recording, CalibrationResult],
+) -> None:
+    """Errors of the sensors are found by the map itself, but are the least part of what is off."""
+    options = MappingOptions.model_validate({"model": {"harmonic": {"search": {"rounds": 0}}}})
+    field_map = map_surveys([found[1]], None, options, ChangesOptions())
+    assert isinstance(field_map, HarmonicMap)
+    assert field_map.learnt.suite is not None
+    doubts = field_map.learnt.origin.survey
+    assert any("look uncalibrated" in each and "l2m map suite" in each for each in doubts)
 
 
 def test_a_drive_that_never_turns_says_what_it_does_not_tell() -> None:

@@ -152,9 +152,9 @@ def test_a_pose_that_lies_elsewhere_is_left_out() -> None:
     assert note.endswith("are left out: 1")
 
 
-def carried_by_hand(seconds: float) -> Trajectory:
-    """Poses at 20 Hz of what a hand turns to and fro, by up to 390 deg/s and 2500 deg/s^2."""
-    at = np.arange(0, seconds, 0.05)
+def carried_by_hand(seconds: float, rate_hz: float = 20.0) -> Trajectory:
+    """Poses of what a hand turns to and fro, by up to 390 deg/s and 2500 deg/s^2."""
+    at = np.arange(0, seconds, 1 / rate_hz)
     turns = np.column_stack([np.sin(6.1 * at), 0.9 * np.sin(5.3 * at + 1), np.sin(4.7 * at + 2)])
     p = 0.2 * np.column_stack([np.sin(2.1 * at), np.sin(1.7 * at + 1), 0.5 * np.sin(2.9 * at)])
     R = Rotation.from_rotvec(turns).as_matrix()
@@ -170,6 +170,26 @@ def test_a_hand_turns_as_suddenly_in_a_gap_as_elsewhere(lost: int) -> None:
     assert without_jumps(with_gaps, OPTIONS).jumps == ()
     vehicle = OPTIONS.model_copy(update={"gaps": 1e-6})
     assert without_jumps(with_gaps, vehicle).jumps  # by what a vehicle does they would be jumps
+
+
+@pytest.mark.parametrize("count", [40, 100, 200])
+@pytest.mark.parametrize("seconds", [2.0, 2.2, 2.4])
+def test_a_jump_over_a_lost_pose_is_found(count: int, seconds: float) -> None:
+    """It is no part of the motion that it is compared with, at any place of a short drive."""
+    drive = DRIVE[np.arange(count)]
+    for row in range(4, count - 6, max(count // 20, 1)):
+        away = jumped(drive, shift(row, 1.0, 0.0))
+        late = round((seconds - 1) * 1e9 / RATE_HZ) * (np.arange(count) > row)
+        (jump,) = without_jumps(replace(away, stamp_ns=away.stamp_ns + late), OPTIONS).jumps
+        assert jump.row == row
+
+
+def test_what_is_a_jump_in_a_gap_does_not_depend_on_itself() -> None:
+    """Poses of a hand at 50 Hz with 18 gaps of 0.3 s."""
+    drive = carried_by_hand(40, 50.0)
+    gone = np.concatenate([k + np.arange(15) for k in range(60, 1960, 105)])
+    with_gaps = drive[np.setdiff1d(np.arange(len(drive)), gone)]
+    assert without_jumps(with_gaps, OPTIONS).jumps == ()
 
 
 def test_a_jump_in_a_gap_of_a_hand_is_found() -> None:
