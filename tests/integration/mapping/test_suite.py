@@ -82,7 +82,9 @@ def test_a_map_of_ideal_sensors_says_that_they_are_not(
     found: tuple[tuple[KnownSensor, ...], Recording, CalibrationResult],
 ) -> None:
     """Errors of the sensors are found by the map itself, but are the least part of what is off."""
-    options = MappingOptions.model_validate({"model": {"harmonic": {"search": {"rounds": 0}}}})
+    few = {"search": {"rounds": 0}}
+    sync = {"thin_distance_m": 0.2, "thin_angle_deg": 20.0}
+    options = MappingOptions.model_validate({"model": {"harmonic": few}, "sync": sync})
     field_map = map_surveys([found[1]], None, options, ChangesOptions())
     assert isinstance(field_map, HarmonicMap)
     assert field_map.learnt.suite is not None
