@@ -73,10 +73,10 @@ def synchronise(
     -----
     Readings beyond the range of their sensor do not count: an axis of them is not what it says.
     """
-    parts, counts = [], []
+    parts, counts, far = [], [], far_turns(recording.trajectory)
     for index, series in enumerate(recording.series):
         readings, count = _synchronise_one(
-            recording.trajectory, index, series, options, round(largest_offset_s * 1e9)
+            recording.trajectory, far, index, series, options, round(largest_offset_s * 1e9)
         )
         parts.append(readings)
         counts.append(count)
@@ -87,12 +87,19 @@ def synchronise(
 
 
 def _synchronise_one(
-    trajectory: Trajectory, index: int, series: FieldSeries, options: SyncOptions, around_ns: int
+    trajectory: Trajectory,
+    far: BoolArray,
+    index: int,
+    series: FieldSeries,
+    options: SyncOptions,
+    around_ns: int,
 ) -> tuple[Readings, SyncCounts]:
     finite = np.asarray(np.isfinite(series.field).all(axis=1))
     repeated = _repeated(series.stamp_ns, finite)
     spanned = _spanned(trajectory.stamp_ns, series.stamp_ns, around_ns)
-    near = between_near_poses(trajectory, series.stamp_ns, options.max_pose_gap_s, around_ns)
+    gap = longest_gap_ns(trajectory.stamp_ns, series.stamp_ns, around_ns)
+    turned = is_in_turn(trajectory.stamp_ns, far, series.stamp_ns, around_ns)
+    near = (gap <= options.max_pose_gap_s * 1e9) & ~turned
     fresh = finite & ~repeated
     keep = fresh & spanned & near
     readings = _with_poses(trajectory, index, series.stamp_ns[keep], series.field[keep])
@@ -217,29 +224,30 @@ def has_pose(trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float) 
     return spanned & (longest_gap_ns(trajectory.stamp_ns, stamp_ns) <= max_pose_gap_s * 1e9)
 
 
-def between_near_poses(
-    trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float, around_ns: int = 0
+def far_turns(trajectory: Trajectory) -> BoolArray:
+    """Return between which of N poses the body turns too far to be interpolated, shape (N - 1,)."""
+    R = trajectory.R
+    return np.asarray(turn_angle(R[:-1].transpose(0, 2, 1) @ R[1:]) > np.deg2rad(MOST_TURN_DEG))
+
+
+def is_in_turn(
+    pose_ns: IntArray, far: BoolArray, stamp_ns: IntArray, around_ns: int = 0
 ) -> BoolArray:
-    """Return whether poses around each reading are near enough to be interpolated, shape (N,).
+    """Return which readings are so near to a far turn of the poses, in time, shape (N,).
 
     Parameters
     ----------
-    trajectory
-        Poses.
+    pose_ns, far
+        Times of poses, and between which of them the body turns too far; see ``far_turns``.
     stamp_ns
-        Times of N readings, within those of the poses.
-    max_pose_gap_s
-        Longest time between two poses that are near.
+        Times of N readings.
     around_ns
-        Poses are near for so long before and after a reading, too.
+        How near.
     """
-    longest = longest_gap_ns(trajectory.stamp_ns, stamp_ns, around_ns)
-    near, R = np.asarray(longest <= max_pose_gap_s * 1e9), trajectory.R
-    far = turn_angle(R[:-1].transpose(0, 2, 1) @ R[1:]) > np.deg2rad(MOST_TURN_DEG)
-    if far.any():
-        touched = _touched(trajectory.stamp_ns, stamp_ns, around_ns)
-        near &= longest_between(far.astype(np.int64), *touched) == 0
-    return near
+    if not far.any():
+        return np.zeros(len(stamp_ns), dtype=np.bool_)
+    touched = _touched(pose_ns, stamp_ns, around_ns)
+    return longest_between(far.astype(np.int64), *touched) > 0
 
 
 def interpolated(trajectory: Trajectory, stamp_ns: IntArray) -> Trajectory:

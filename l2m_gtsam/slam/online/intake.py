@@ -13,7 +13,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between
-from l2m_gtsam.recording.sync import at_poses, between_near_poses, has_pose, interpolated, twists
+from l2m_gtsam.recording.sync import at_poses, far_turns, has_pose, interpolated, is_in_turn, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.slam.drift import steady_share, steady_turn
 from l2m_gtsam.slam.drive import KnownSensors
@@ -340,7 +340,7 @@ class Intake:
         offset, options = self._known.offset, self._options
         at = waiting.stamp_ns + np.round(offset[waiting.sensor] / NS).astype(np.int64)
         near = has_pose(trajectory, at, options.max_pose_gap_s)
-        near &= between_near_poses(trajectory, at, options.max_pose_gap_s)
+        near &= ~is_in_turn(trajectory.stamp_ns, far_turns(trajectory), at)
         there = waiting[np.flatnonzero(near)]
         taken = thinned_readings(there, trajectory, rows, options.key_poses.readings)
         return at_poses(taken, trajectory, offset)
