@@ -11,18 +11,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between, carried_back, compose, moved
 from l2m_gtsam.options import Options
+from l2m_gtsam.recording.step_motion import (
+    AXES,
+    NEIGHBOURS,
+    MotionAbout,
+    Steps,
+    changes_among,
+    motion_about,
+    steps_of,
+)
 
-NEIGHBOURS = 3  # steps before and after, from which the motion is predicted
 LEAST_STEPS = 4  # drives of fewer steps have no jumps
 ROUNDS = 20  # limit of detections without the jumps found before: a few are needed
 MAX_REPORTED = 3  # jumps that are reported one by one
-AXES = 3
-GAP = 2.0  # times the usual time of a step
 GRADES = 4  # of lengths of gaps, for each doubling
 USUAL = 0.98  # share of a drive's accelerations; jumps are among the others
 
@@ -159,52 +164,13 @@ def without_jumps(trajectory: Trajectory, options: JumpOptions) -> RepairedOdome
 
 
 @dataclass(frozen=True)
-class _Steps:
-    """N steps between poses.
-
-    Attributes
-    ----------
-    seconds, middle
-        How long each takes, and when its middle is, shape (N,).
-    turn, shift
-        Rotation vector in rad, and translation in m along the axes of the pose before, (N, 3).
-    """
-
-    seconds: FloatArray
-    middle: FloatArray
-    turn: FloatArray
-    shift: FloatArray
-
-    def velocity(self) -> FloatArray:
-        """Return rad/s and m/s, the latter along the axes that the body has half way, (N, 6).
-
-        On an arc these do not change, however long the steps are.
-        """
-        half = Rotation.from_rotvec(self.turn / 2).inv()
-        return np.hstack([self.turn, half.apply(self.shift)]) / self.seconds[:, None]
-
-
-def _steps_of(trajectory: Trajectory) -> _Steps:
-    at = 1e-9 * (trajectory.stamp_ns - trajectory.stamp_ns[0])
-    R_back = trajectory.R[:-1].transpose(0, 2, 1)
-    return _Steps(
-        seconds=np.diff(at),
-        middle=(at[1:] + at[:-1]) / 2,
-        turn=Rotation.from_matrix(R_back @ trajectory.R[1:]).as_rotvec(),
-        shift=np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p, axis=0)),
-    )
-
-
-@dataclass(frozen=True)
 class _StepComparison:
     """What is expected of N steps, and which are jumps.
 
     Attributes
     ----------
-    R, t
-        The motion about each, as that of a step, shapes (N, 3, 3) and (N, 3), metres.
-    off
-        What the steps differ from it by: rotation vector in rad and translation in m, (N, 6).
+    motion
+        The motion about each.
     reach
         Time of each times that to its neighbours, s^2, shape (N,).
     acceleration
@@ -213,21 +179,15 @@ class _StepComparison:
         Which differ too much, shape (N,).
     """
 
-    R: FloatArray
-    t: FloatArray
-    off: FloatArray
+    motion: MotionAbout
     reach: FloatArray
     acceleration: FloatArray
     jumped: BoolArray
 
-    def sizes(self) -> FloatArray:
-        """Return by how much steps differ in rad and m, shape (N, 2)."""
-        return np.asarray(np.linalg.norm(self.off.reshape(-1, 2, 3), axis=2))
-
 
 def _jumps_among(trajectory: Trajectory, options: JumpOptions) -> _StepComparison:
     """Detect jumps, repeated without those found before until they are the same."""
-    steps = _steps_of(trajectory)
+    steps = steps_of(trajectory)
     jumped = np.zeros(len(steps.seconds), dtype=np.bool_)
     # Once: with what is found later the drive's own motion would depend on what it decides.
     first = _compared(steps, ~jumped, options).jumped
@@ -243,15 +203,14 @@ def _jumps_among(trajectory: Trajectory, options: JumpOptions) -> _StepCompariso
 
 
 def _compared(
-    steps: _Steps, good: BoolArray, options: JumpOptions, usual: FloatArray | float = 0.0
+    steps: Steps, good: BoolArray, options: JumpOptions, usual: FloatArray | float = 0.0
 ) -> _StepComparison:
     """Compare N steps with their good neighbours; ``usual`` never is a jump, shape (N, 2)."""
-    motion = _motion_about(steps, good)
-    reach, changes = steps.seconds * motion.away, _changes(steps, good)
+    motion = motion_about(steps, good)
+    reach, changes = steps.seconds * motion.away, changes_among(steps, good)
     # Mean squares per axis.
     acceleration = np.asarray(np.mean(changes**2, axis=0) / AXES)
-    found = _StepComparison(motion.R, motion.t, motion.off, reach, acceleration, good)
-    sizes = found.sizes()
+    sizes = motion.sizes()
     limits = np.maximum(
         np.array([np.deg2rad(options.rotation_deg), options.position_m]),
         options.scatter * np.median(sizes, axis=0),
@@ -259,13 +218,13 @@ def _compared(
     most = np.array([np.deg2rad(options.acceleration_deg_s2), options.acceleration_m_s2])
     half, own = np.quantile(changes, [0.5, USUAL], axis=0)
     within = np.minimum(np.maximum(most, half), options.accelerations * own)
-    gap = steps.seconds > GAP * np.median(steps.seconds)  # in which the vehicle may have stopped
-    limits = np.maximum(limits, reach[:, None] * np.where(gap[:, None], most, within))
-    return replace(found, jumped=np.any(sizes > np.maximum(limits, usual), axis=1))
+    acceptable = np.where(steps.is_gap[:, None], most, within)
+    limits = np.maximum(np.maximum(limits, reach[:, None] * acceptable), usual)
+    return _StepComparison(motion, reach, acceleration, np.any(sizes > limits, axis=1))
 
 
 def _usual_over_gaps(
-    trajectory: Trajectory, steps: _Steps, jumped: BoolArray, options: JumpOptions
+    trajectory: Trajectory, steps: Steps, jumped: BoolArray, options: JumpOptions
 ) -> FloatArray:
     """Return what a drive's own motion may differ by over each of its gaps that looks like a jump.
 
@@ -282,8 +241,7 @@ def _usual_over_gaps(
     -------
     Radians and metres, shape (N - 1, 2); 0 for all other steps.
     """
-    usual, period = np.zeros((len(jumped), 2)), float(np.median(steps.seconds))
-    gap = steps.seconds > GAP * period
+    usual, period, gap = np.zeros((len(jumped), 2)), steps.period, steps.is_gap
     suspect = np.flatnonzero(gap & jumped)
     # About so many periods: gaps of much the same length are compared with the same motion.
     lost = np.exp2(np.ceil(GRADES * np.log2(steps.seconds[suspect] / period)) / GRADES)
@@ -315,71 +273,19 @@ def _own_motion(trajectory: Trajectory, good: BoolArray, count: int, period: flo
     kept = np.flatnonzero((place == 0) | (place >= count))
     part = trajectory[kept]
     wrong = np.diff(np.append(0, np.cumsum(~good))[kept]) > 0
-    steps = _steps_of(part)
+    steps = steps_of(part)
+    # Stamps that come in bursts make so many steps much shorter or longer.
     lasting = np.abs(steps.seconds - count * period) < 0.5 * count * period
     chosen = lasting & (np.diff(kept) == count) & ~wrong
     if not chosen.any():
         return np.zeros(2)
-    off = _motion_about(steps, ~wrong).off[chosen]
-    sizes = np.linalg.norm(off.reshape(-1, 2, AXES), axis=2)
+    sizes = motion_about(steps, ~wrong).sizes()[chosen]
     largest = np.quantile(sizes, USUAL, axis=0)
     return np.asarray(np.nan_to_num(largest))  # NaN without neighbours
 
 
-@dataclass(frozen=True)
-class _MotionAbout:
-    """The motion of good steps about each of N steps, as that of the step.
-
-    Attributes
-    ----------
-    R, t
-        The pose after in the frame of the pose before, (N, 3, 3) and (N, 3), metres.
-    off
-        What the steps differ from it by: rotation vector in rad and translation in m, (N, 6).
-    away
-        Time from each step to the good ones, seconds, shape (N,).
-    """
-
-    R: FloatArray
-    t: FloatArray
-    off: FloatArray
-    away: FloatArray
-
-
-def _motion_about(steps: _Steps, good: BoolArray) -> _MotionAbout:
-    velocity, away = _about(steps, good)
-    expected = velocity * steps.seconds[:, None]
-    turn = Rotation.from_rotvec(expected[:, :3])
-    shift = Rotation.from_rotvec(expected[:, :3] / 2).apply(expected[:, 3:])
-    off = np.hstack(
-        [(turn.inv() * Rotation.from_rotvec(steps.turn)).as_rotvec(), steps.shift - shift]
-    )
-    off[:, 3:] = turn.inv().apply(off[:, 3:])
-    return _MotionAbout(turn.as_matrix(), shift, off, away)
-
-
-def _about(steps: _Steps, good: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Return the median velocity of good steps about each, (N, 6), and their time from it, (N,)."""
-    rows = np.flatnonzero(good)
-    before = np.searchsorted(rows, np.arange(len(good)))
-    after = before + good  # a good step is no neighbour of its own
-    beside = np.arange(NEIGHBOURS)
-    slots = np.hstack([before[:, None] - 1 - beside, after[:, None] + beside])
-    there = (slots >= 0) & (slots < len(rows))
-    near = rows[np.clip(slots, 0, len(rows) - 1)]
-    away = np.where(there, np.abs(steps.middle[near] - steps.middle[:, None]), np.nan)
-    velocity = np.where(there[:, :, None], steps.velocity()[near], np.nan)
-    return np.nanmedian(velocity, axis=1), np.nanmedian(away, axis=1)
-
-
-def _changes(steps: _Steps, good: BoolArray) -> FloatArray:
-    """Return how fast velocities change between good steps, rad/s^2 and m/s^2, shape (M, 2)."""
-    change = np.diff(steps.velocity()[good], axis=0) / np.diff(steps.middle[good])[:, None]
-    return np.asarray(np.linalg.norm(change.reshape(-1, 2, AXES), axis=2))
-
-
 def _jump(trajectory: Trajectory, found: _StepComparison, row: int) -> Jump:
-    angle, distance = found.sizes()[row].tolist()
+    angle, distance = found.motion.sizes()[row].tolist()
     variance = found.acceleration * found.reach[row] ** 2
     return Jump(
         row=row,
@@ -403,7 +309,7 @@ def _repaired(
     ends = [*(each.row + 1 for each in jumps[1:]), len(trajectory)]
     for jump, end in zip(jumps, ends, strict=True):
         k = jump.row
-        step = RigidTransform(found.R[k], found.t[k])
+        step = RigidTransform(found.motion.R[k], found.motion.t[k])
         first = compose(RigidTransform(R[k], p[k]), step)
         own = RigidTransform(trajectory.R[k + 1], trajectory.p[k + 1])
         later = slice(k + 1, end)
