@@ -1,5 +1,6 @@
 """GTSAM factors for magnetometers in a mapped field."""
 
+from l2m_factors.block_errors import ReadingErrors
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.complexity import (
     ComplexityPenalty,
@@ -72,6 +73,7 @@ __all__ = [
     "P",
     "PoseMotion",
     "Q",
+    "ReadingErrors",
     "ReadingResiduals",
     "Residual",
     "S",

@@ -76,8 +76,8 @@ class MapBatch(KeyPoseBatch):
     def _field(self, values: gtsam.Values) -> DifferentiableMap:
         return self._map
 
-    def _own_stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
-        return values.atPose3(X(key_pose)).matrix().tobytes()
+    def _own_keys(self, key_poses: list[int]) -> list[int]:
+        return [X(k) for k in key_poses]
 
 
 def key_pose_factor(

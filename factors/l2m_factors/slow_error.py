@@ -17,6 +17,7 @@ it readings of the same error count as so many independent ones: sigmas are too 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -48,7 +49,7 @@ class SlowError:
         """Return a copy for so many readings; a ValueError if it is of another number of them."""
         return SlowError(self.key_pose, numbers("SlowError.shares", self.shares, (count, 2)))
 
-    @property
+    @cached_property
     def keys(self) -> list[int]:
         """The error at both key poses."""
         return [N(self.key_pose), N(self.key_pose + 1)]

@@ -32,6 +32,7 @@ and with the turn R and the way d along the axes of the frame of the poses
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -67,7 +68,7 @@ class StepError:
         slope = numbers("StepError.slope", self.slope, (count, 3, 6))
         return StepError(self.key_pose, self.step, slope)
 
-    @property
+    @cached_property
     def keys(self) -> list[int]:
         """The two key poses."""
         return [X(self.key_pose), X(self.key_pose + 1)]

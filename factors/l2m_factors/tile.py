@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.joint_residual import Residual
-from l2m_factors.key_pose_batch import KeyPoseBatch
+from l2m_factors.key_pose_batch import KeyPoseBatch, are_same
 from l2m_factors.key_pose_readings import (
     Calibrations,
     KeyPoseReadings,
@@ -127,7 +127,7 @@ class TileBatch(KeyPoseBatch):
         self._point: tuple[FloatArray, FloatArray, Calibrations]  # of the last evaluation
         self._by_weights: dict[int, FloatArray] = {}  # what no factor has taken yet
         self._places: TilePlaces | None = None  # where they were asked for last
-        self._placed: dict[int, bytes] = {}
+        self._placed = gtsam.Values()  # what they depend on
 
     def keys_of(self, key_pose: int) -> list[int]:
         """Return the keys that the readings on a key pose depend on.
@@ -153,15 +153,13 @@ class TileBatch(KeyPoseBatch):
 
     def places(self, values: gtsam.Values, key_pose: int) -> TilePlaces:
         """Return where the readings on a key pose are, without a query of the field."""
-        stamp = self._stamp(values, key_pose)
-        if self._places is None or self._placed.get(key_pose) != stamp:
-            last = self._last
-            if last is not None and last.seen.get(key_pose) == stamp:
-                point, self._placed = self._point, last.seen
+        keys, last = self._keys_asked(key_pose), self._last
+        if self._places is None or not are_same(values, self._placed, keys):
+            if last is not None and are_same(values, last.at, keys):
+                point, self._placed = self._point, last.at
             else:
-                present = self._present(values)
-                point = self._evaluation_point(values, present)
-                self._placed = self._stamps(values, present)
+                point = self._evaluation_point(values)
+                self._placed = self._extracted(values)
             self._places = self._places_at(*point)
         return self._places[self._rows[key_pose]]
 
@@ -181,8 +179,8 @@ class TileBatch(KeyPoseBatch):
         relative = self._pose(values, key_pose)
         return [by_key, -by_key @ relative.inverse().AdjointMap(), *blocks]
 
-    def _evaluated(self, values: gtsam.Values, present: list[int]) -> KeyPoseResiduals:
-        self._point = R, p, sensors = self._evaluation_point(values, present)
+    def _evaluated(self, values: gtsam.Values) -> KeyPoseResiduals:
+        self._point = R, p, sensors = self._evaluation_point(values)
         self._by_weights = {}
         return key_pose_residuals(self._readings, self._field(values), R, p, sensors)
 
@@ -223,12 +221,9 @@ class TileBatch(KeyPoseBatch):
     def _field(self, values: gtsam.Values) -> DifferentiableMap:
         return WeightedField(self._tile, values.atVector(M(self._number)))
 
-    def _own_stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
-        own = values.atVector(M(self._number)).tobytes()
-        if key_pose != self._anchor:
-            own += values.atPose3(X(self._anchor)).matrix().tobytes()
-            own += values.atPose3(X(key_pose)).matrix().tobytes()
-        return own
+    def _own_keys(self, key_poses: list[int]) -> list[int]:
+        moving = [X(k) for k in key_poses if k != self._anchor]
+        return [M(self._number), *moving, *([X(self._anchor)] if moving else [])]
 
 
 def tile_factor(

@@ -14,9 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from l2m_factors.arguments import numbers
+from l2m_factors.block_errors import BlockErrors, ReadingErrors
 from l2m_factors.complexity import ComplexityPenalty
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.joint_residual import Residual
+from l2m_factors.key_pose_batch import are_same
 from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
 from l2m_factors.keys import M, X
 from l2m_factors.motion import skew
@@ -80,13 +82,17 @@ class BlockRows:
     of_key_pose: tuple[slice, ...]
     of_sensor: tuple[npt.NDArray[np.int64], ...]
 
-    def fill(self, jacobians: list[FloatArray], own: TileDerivatives) -> None:
-        """Put in derivatives of the n readings by each of ``keys``, shape (q n, .) each."""
+    def derivatives(self, own: TileDerivatives) -> list[FloatArray]:
+        """Return derivatives of the n readings by each of ``keys``, shape (n, q, .) each."""
         blocks = [placed(own.by_key, at) for at in self.of_key_pose]
         blocks += [own.by_anchor] if self.of_key_pose else []
         blocks += [] if own.by_weights is None else [own.by_weights]
         blocks += [placed(each, at) for at in self.of_sensor for each in own.by_sensor]
-        for slot, block in enumerate(blocks):
+        return blocks
+
+    def fill(self, jacobians: list[FloatArray], own: TileDerivatives) -> None:
+        """Put in derivatives of the n readings by each of ``keys``, shape (q n, .) each."""
+        for slot, block in enumerate(self.derivatives(own)):
             jacobians[slot] = block.reshape(-1, block.shape[2])
 
 
@@ -131,8 +137,6 @@ class TileBlocks(TileBatch):
         super().__init__(number, anchor, field, readings, fixed)
         self._W = numbers("whitening", whitening, (len(readings), 3, 3))
         self._on_anchor = self._rows.get(anchor, np.empty(0, dtype=np.int64))
-        poses = [X(k) for k in dict.fromkeys([*self._rows, anchor])]
-        self._every_key = [*poses, M(number), *self._variables.keys(self._every_sensor)]
         self._evaluated_at = gtsam.Values()
         self._found: KeyPoseResiduals
         self._white: FloatArray
@@ -146,6 +150,53 @@ class TileBlocks(TileBatch):
         few = SENSORS if self._variables.keys(sensors) else len(sensors)
         for first in range(0, len(sensors), few):
             yield self._residual(key_poses, sensors[first : first + few])
+
+    def joint_residual(self, key_poses: Sequence[int], errors: Sequence[ReadingErrors]) -> Residual:
+        """Return the white residual of the readings on some key poses, which share errors.
+
+        It is that of ``tile_residual`` for each, one after the other.
+
+        Parameters
+        ----------
+        key_poses
+            Their numbers.
+        errors
+            Of the readings on each of them.
+
+        Raises
+        ------
+        ValueError
+            There are no readings on a key pose, or an array is of another number of readings.
+        """
+        counts = [len(self.rows_of(k)) for k in key_poses]
+        sensors = self._sensors_on(key_poses)
+        own_keys = [M(self._number), *self._variables.keys(sensors)]
+        block = self._block(key_poses, own_keys, sensors)
+        ends = np.cumsum(counts).tolist()
+        runs = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+        shared = BlockErrors(runs, errors, self._W[block.rows])
+        keys = list(dict.fromkeys([*block.keys, *shared.keys]))
+
+        def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
+            self._evaluate(values, block.keys)
+            e = (self._white[block.rows] + shared.residual(values))[:, :, None]
+            shared.project(e)
+            if jacobians is not None:
+                every = self._reading_derivatives()[block.rows]
+                sums = dict(zip(block.keys, block.derivatives(every), strict=True))
+                for each in shared.jacobians(values):
+                    if each.key not in sums:
+                        sums[each.key] = np.zeros((len(e), 3, each.value.shape[2]))
+                    sums[each.key][each.at] += each.value
+                every_block = np.concatenate([sums[key] for key in keys], axis=2)
+                shared.project(every_block)
+                ends = np.cumsum([sums[key].shape[2] for key in keys[:-1]])
+                parts = np.split(every_block.reshape(3 * len(e), -1), ends, axis=1)
+                for slot, part in enumerate(parts):
+                    jacobians[slot] = part
+            return e.ravel()
+
+        return Residual(keys, 3 * len(block.rows), error)
 
     def penalty(self, key_poses: Sequence[int], every: ComplexityPenalty) -> Residual | None:
         """Return the penalty of readings on some key poses, (n,); None where it has no variables.
@@ -164,7 +215,7 @@ class TileBlocks(TileBatch):
         own = every[block.rows]
 
         def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
-            self._evaluate(values)
+            self._evaluate(values, block.keys)
             if jacobians is not None:
                 block.fill(jacobians, self._place_derivatives()[block.rows].along(own.slope))
             away = self._where.x[block.rows] - own.at
@@ -180,7 +231,7 @@ class TileBlocks(TileBatch):
         block = self._block(key_poses, keys, sensors)
 
         def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
-            self._evaluate(values)
+            self._evaluate(values, block.keys)
             if jacobians is not None:
                 block.fill(jacobians, self._reading_derivatives()[block.rows])
             return self._white[block.rows].ravel()
@@ -204,26 +255,16 @@ class TileBlocks(TileBatch):
             tuple(np.flatnonzero(sensor == each) for each in free),
         )
 
-    def _evaluate(self, values: gtsam.Values) -> None:
-        """Evaluate all readings, if anything that they depend on has changed."""
-        at = self._own_values(values)
-        if at.equals(self._evaluated_at, 0.0):
+    def _evaluate(self, values: gtsam.Values, keys: list[int]) -> None:
+        """Evaluate all readings, if any of these variables has changed."""
+        if are_same(values, self._evaluated_at, keys):
             return
-        self._found = self._evaluated(values, self._present(values))
+        at = self._extracted(values)
+        self._found = self._evaluated(values)
         self._where = self._places_at(*self._point)
         self._white = np.einsum("nij,nj->ni", self._W, self._found.reading.residual)
         self._of_readings = self._of_places = None
         self._evaluated_at = at
-
-    def _own_values(self, values: gtsam.Values) -> gtsam.Values:
-        """Return what the readings depend on, as far as it is there: a factor may be asked alone.
-
-        Two calls of GTSAM take a twentieth of what asking for one value after the other takes.
-        """
-        try:
-            return values.extract(self._every_key)
-        except RuntimeError:
-            return values.extract([key for key in self._every_key if values.exists(key)])
 
     def _reading_derivatives(self) -> TileDerivatives:
         """Return derivatives of the white residuals where they were evaluated."""

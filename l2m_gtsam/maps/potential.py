@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 from pydantic import Field
 
 from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray
 from l2m_gtsam.options import Options
 
 AXES = 3
-OTHERS = ((1, 2), (0, 2), (0, 1))
 PAIRS = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # two axes and the third
 
 
@@ -88,16 +88,17 @@ class PotentialBasis:
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each weight at points (N, 3) in metres, shape (N, 3, m)."""
-        S, C = self._sines(points)
         found = np.empty((len(points), AXES, len(self)))
-        found[:, :, :AXES] = np.eye(AXES)
-        for i, (j, k) in enumerate(OTHERS):
-            found[:, i, AXES:] = self.waves[:, i] * C[:, i] * S[:, j] * S[:, k]
+        write_features(*self._sines(points), self._distinct.which, self.waves, found)
         return found
 
     def slopes(self, points: FloatArray) -> FloatArray:
         """Return the derivatives of the features by x, y and z, shape (N, 3, 3, m)."""
-        S, C = self._sines(points)
+        which = self._distinct.which
+        S, C = (
+            np.stack([own[:, axis, which[axis]] for axis in range(AXES)], axis=1)
+            for own in self._sines(points)
+        )
         found = np.zeros((len(points), AXES, AXES, len(self)))
         product = S[:, 0] * S[:, 1] * S[:, 2]
         for i in range(AXES):
@@ -117,36 +118,125 @@ class PotentialBasis:
         by_features
             Its derivative by the features there, shape (N, 3, m).
         """
-        S, C = self._sines(points)
-        by, w, found = by_features[:, :, AXES:], self.waves, np.empty_like(points)
-        product = S[:, 0] * S[:, 1] * S[:, 2]
-        for i in range(AXES):
-            found[:, i] = -(by[:, i] * product) @ w[:, i] ** 2
-        for i, j, k in PAIRS:
-            mixed = w[:, i] * w[:, j] * C[:, i] * C[:, j] * S[:, k]
-            found[:, j] += np.einsum("nm,nm->n", by[:, i], mixed)
-            found[:, i] += np.einsum("nm,nm->n", by[:, j], mixed)
+        found = np.empty((len(points), AXES))
+        which = self._distinct.which
+        write_by_points(*self._sines(points), which, self.waves, by_features, found)
         return found
 
     def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, of weights of shape (m,)."""
-        return self.features(points) @ weights, self.slopes(points) @ weights
+        field, gradient = np.empty((len(points), AXES)), np.empty((len(points), AXES, AXES))
+        which, w = self._distinct.which, np.asarray(weights, dtype=np.float64)
+        write_field(*self._sines(points), which, self.waves, w, field, gradient)
+        return field, gradient
 
     def _sines(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return normalised sines and cosines along each axis, shape (N, 3, n)."""
-        S, norm = np.empty((len(points), AXES, len(self.waves))), np.sqrt(2 / self.size)
-        C = np.empty_like(S)
-        for axis, (numbers, own) in enumerate(self._distinct):
-            angle = np.outer(points[:, axis] - self.low[axis], numbers)
-            S[:, axis] = (norm[axis] * np.sin(angle))[:, own]
-            C[:, axis] = (norm[axis] * np.cos(angle))[:, own]
-        return S, C
+        """Return normalised sines and cosines of the distinct waves of each axis, (N, 3, d)."""
+        angle = (points - self.low)[:, :, None] * self._distinct.numbers
+        norm = np.sqrt(2 / self.size)[:, None]
+        return norm * np.sin(angle), norm * np.cos(angle)
 
     @cached_property
-    def _distinct(self) -> tuple[tuple[FloatArray, IntArray], ...]:
-        """The distinct wave numbers along each axis, and which of them each eigenfunction has."""
-        pairs = (np.unique(own, return_inverse=True) for own in self.waves.T)
-        return tuple((numbers, which.ravel()) for numbers, which in pairs)
+    def _distinct(self) -> "DistinctWaves":
+        pairs = [np.unique(own, return_inverse=True) for own in self.waves.T]
+        numbers = np.zeros((AXES, max(len(own) for own, _ in pairs)))
+        for axis, (own, _) in enumerate(pairs):
+            numbers[axis, : len(own)] = own
+        return DistinctWaves(numbers, np.stack([which.ravel() for _, which in pairs]))
+
+
+@dataclass(frozen=True)
+class DistinctWaves:
+    """Wave numbers of eigenfunctions along each axis: many have the same.
+
+    Attributes
+    ----------
+    numbers
+        Up to d along each axis, rad/m, the rest zeros, shape (3, d).
+    which
+        Which of them n eigenfunctions have, shape (3, n).
+    """
+
+    numbers: FloatArray
+    which: IntArray
+
+
+# Functions that follow write what the methods of their names return. They have sines and cosines
+# along each axis as of ``_sines``, ``which`` as of ``DistinctWaves``, and wave numbers (n, 3).
+
+
+@njit(cache=True, nogil=True)
+def write_features(
+    S: FloatArray, C: FloatArray, which: IntArray, waves: FloatArray, found: FloatArray
+) -> None:
+    """Write features, shape (N, 3, n + 3)."""
+    for p in range(len(S)):
+        for i in range(AXES):
+            for j in range(AXES):
+                found[p, i, j] = 1.0 if i == j else 0.0
+        for m in range(len(waves)):
+            a, b, c = which[0, m], which[1, m], which[2, m]
+            x, y, z = S[p, 0, a], S[p, 1, b], S[p, 2, c]
+            found[p, 0, AXES + m] = waves[m, 0] * C[p, 0, a] * y * z
+            found[p, 1, AXES + m] = waves[m, 1] * C[p, 1, b] * x * z
+            found[p, 2, AXES + m] = waves[m, 2] * C[p, 2, c] * x * y
+
+
+@njit(cache=True, nogil=True)
+def write_by_points(
+    S: FloatArray,
+    C: FloatArray,
+    which: IntArray,
+    waves: FloatArray,
+    by_features: FloatArray,
+    found: FloatArray,
+) -> None:
+    """Write derivatives by points, shape (N, 3), of a scalar with those by features."""
+    for p in range(len(S)):
+        by_x, by_y, by_z = 0.0, 0.0, 0.0
+        for m in range(len(waves)):
+            a, b, c = which[0, m], which[1, m], which[2, m]
+            x, y, z = S[p, 0, a], S[p, 1, b], S[p, 2, c]
+            u, v, w = waves[m]
+            dx, dy, dz = u * C[p, 0, a], v * C[p, 1, b], w * C[p, 2, c]
+            xy, xz, yz, own = dx * dy * z, dx * dz * y, dy * dz * x, -x * y * z
+            f, g, h = by_features[p, :, AXES + m]
+            by_x += f * u * u * own + g * xy + h * xz
+            by_y += f * xy + g * v * v * own + h * yz
+            by_z += f * xz + g * yz + h * w * w * own
+        found[p, 0], found[p, 1], found[p, 2] = by_x, by_y, by_z
+
+
+@njit(cache=True, nogil=True)
+def write_field(
+    S: FloatArray,
+    C: FloatArray,
+    which: IntArray,
+    waves: FloatArray,
+    weights: FloatArray,
+    field: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Write the field (N, 3) and its gradient (N, 3, 3)."""
+    for p in range(len(S)):
+        b, G = field[p], gradient[p]
+        b[:], G[:] = weights[:AXES], 0.0
+        for m in range(len(waves)):
+            i, j, k = which[0, m], which[1, m], which[2, m]
+            x, y, z = S[p, 0, i], S[p, 1, j], S[p, 2, k]
+            u, v, w = waves[m]
+            dx, dy, dz = u * C[p, 0, i], v * C[p, 1, j], w * C[p, 2, k]
+            own, product = weights[AXES + m], weights[AXES + m] * x * y * z
+            b[0] += own * dx * y * z
+            b[1] += own * x * dy * z
+            b[2] += own * x * y * dz
+            G[0, 0] -= u * u * product
+            G[1, 1] -= v * v * product
+            G[2, 2] -= w * w * product
+            G[0, 1] += own * dx * dy * z
+            G[0, 2] += own * dx * y * dz
+            G[1, 2] += own * x * dy * dz
+        G[1, 0], G[2, 0], G[2, 1] = G[0, 1], G[0, 2], G[1, 2]
 
 
 def smallest_waves(size: FloatArray, count: int) -> FloatArray:

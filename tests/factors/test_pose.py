@@ -252,14 +252,14 @@ def test_a_factor_of_wrong_arguments_is_refused_in_one_line() -> None:
 
 
 class Interrupted(MapBatch):
-    """A batch that another thread asks for other values while it stamps what it has evaluated."""
+    """A batch that another thread asks for other values while it keeps what it is evaluated at."""
 
     between: list[gtsam.Values]
 
-    def _stamps(self, values: gtsam.Values, present: list[int]) -> dict[int, bytes]:
+    def _extracted(self, values: gtsam.Values) -> gtsam.Values:
         if self.between:
             self.residuals(self.between.pop(), 0)
-        return super()._stamps(values, present)
+        return super()._extracted(values)
 
 
 def test_two_threads_get_their_own_residuals() -> None:

@@ -10,7 +10,11 @@ from l2m_factors import (
     ComplexityPenalty,
     KeyPoseReadings,
     M,
+    N,
+    ReadingErrors,
     Residual,
+    SlowError,
+    StepError,
     TileBatch,
     TileBlocks,
     Whitening,
@@ -74,6 +78,86 @@ def test_a_block_is_its_key_poses_together(
     assert own.keys() == other.keys()
     for key, block in own.items():
         assert_alike(block, other[key])
+
+
+def random_errors(seed: int, key_pose: int, count: int, slow: bool) -> ReadingErrors:
+    """Return what so many readings share: two errors, a step that is off, and perhaps a slow one.
+
+    Common errors are a whitening's: ``I - B B^T`` has no direction that it turns round.
+    """
+    rng = np.random.default_rng([seed, key_pose])
+    common = np.linalg.qr(rng.normal(size=(3 * count, 2)))[0] * rng.uniform(0.1, 0.9, 2)
+    step = StepError(
+        key_pose, gtsam.Pose3.Expmap(rng.normal(0, 0.3, 6)), rng.normal(0, 20, (count, 3, 6))
+    )
+    return ReadingErrors(
+        common, step, SlowError(key_pose, rng.normal(size=(count, 2))) if slow else None
+    )
+
+
+def with_slow_errors(values: gtsam.Values, seed: int) -> gtsam.Values:
+    rng = np.random.default_rng(seed)
+    for k in range(3):
+        values.insert(N(k), rng.normal(size=3))
+    return values
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    free=st.booleans(),
+    slow=st.booleans(),
+    anchor=st.integers(0, 2),
+    chosen=st.sets(st.integers(0, 1), min_size=1),
+)
+@settings(deadline=None, max_examples=25)
+def test_a_block_with_shared_errors_is_its_key_poses_together(
+    seed: int, free: bool, slow: bool, anchor: int, chosen: set[int]
+) -> None:
+    readings, values, key_poses = random_carried(seed), tile_values(seed, 3), sorted(chosen)
+    values = with_slow_errors(values, seed)
+    W, fixed = random_whitening(seed, len(readings)), None if free else calibrations(values)
+    batch = TileBatch(TILE, anchor, BASIS, readings, fixed)
+    errors = {k: random_errors(seed, k, len(batch.rows_of(k)), slow) for k in key_poses}
+    theirs = joint_residual(
+        [
+            tile_residual(batch, k, Whitening(W[batch.rows_of(k)], own.common), own.step, own.slow)
+            for k, own in errors.items()
+        ]
+    )
+    blocks = blocks_of(readings, anchor, W, None if free else values)
+    ours = blocks.joint_residual(key_poses, list(errors.values()))
+    assert_alike(ours.error(values, None), theirs.error(values, None))
+    own, other = derivatives(ours, values), derivatives(theirs, values)
+    assert own.keys() == other.keys()
+    for key, block in own.items():
+        assert_alike(block, other[key])
+
+
+def test_derivatives_with_shared_errors_are_those_of_finite_differences() -> None:
+    readings, values = random_carried(6), with_slow_errors(tile_values(6, 3), 6)
+    blocks = blocks_of(readings, 0, random_whitening(6, len(readings)), None)
+    errors = [random_errors(6, k, len(blocks.rows_of(k)), True) for k in blocks.key_poses]
+    assert_jacobians_match(blocks.joint_residual(blocks.key_poses, errors).factor(), values)
+
+
+def test_shared_errors_are_kept_and_wrong_ones_refused() -> None:
+    readings, values = random_carried(7), with_slow_errors(tile_values(7, 3), 7)
+    blocks = blocks_of(readings, 2, random_whitening(7, len(readings)), values)
+    count = len(blocks.rows_of(0))
+    own = random_errors(7, 0, count, True)
+    residual = blocks.joint_residual([0], [own])
+    before = residual.error(values, None)
+    assert own.slow is not None
+    for array in (own.common, own.step.slope, own.slow.shares):
+        array[:] = 0
+    np.testing.assert_array_equal(residual.error(values, None), before)
+    short = random_errors(7, 0, count - 1, True)
+    with pytest.raises(ValueError, match=r"^ReadingErrors.common: of shape"):
+        blocks.joint_residual([0], [short])
+    with pytest.raises(ValueError, match=r"^StepError.slope: of shape"):
+        blocks.joint_residual([0], [ReadingErrors(own.common, short.step)])
+    with pytest.raises(ValueError, match=r"^key_pose: 7 has no readings; see key_poses of"):
+        blocks.joint_residual([7], [own])
 
 
 @given(seed=st.integers(0, 10_000), free=st.booleans(), anchor=st.integers(0, 2))

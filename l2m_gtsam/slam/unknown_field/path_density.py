@@ -120,18 +120,22 @@ class PathDensity:
         r = at.z - H
         by_noise = self._noise(r).ravel()
         pulled = flat.T @ by_noise
-        u = cho_solve((lower, True), pulled)
+        covariance = cho_solve((lower, True), np.eye(m))
+        u = covariance @ pulled
         alpha = by_noise - white @ u  # K^-1 r
         fit = 0.5 * (r.ravel() @ by_noise - pulled @ u)
         # d cost = tr(W^T d Phi) with W = T^-1 Phi (I + Phi^T T^-1 Phi)^-1 - alpha u^T.
-        W = cho_solve((lower, True), white.T).T - np.outer(alpha, u)
+        W = white @ covariance
+        W -= np.outer(alpha, u)
         by_features = W.reshape(N, AXES, m)
-        by_C = np.einsum("nam,nbm->ab", by_features, own)
-        by_own = C.T @ by_features
-        by_place = self._field.by_points(x, R @ by_own)
+        by_own_C = by_features @ own.transpose(0, 2, 1)  # of each reading; (3, 3)
+        by_place = self._field.by_points(x, (R @ C.T) @ by_features)
         # A turn w takes b to b - w x b, and the sensor by R (w x t).
         lever = np.einsum("nji,nj->ni", R, by_place)
-        by_turn = np.cross(by_own.transpose(0, 2, 1), own.transpose(0, 2, 1)).sum(axis=1)
+        by_own = C.T @ by_own_C
+        by_turn = np.stack(
+            [by_own[:, j, k] - by_own[:, k, j] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1
+        )
         by_turn += np.cross(t, lever)
         by_turn += 0.5 * np.cross(turn, by_turn)  # d Exp(w), to first order in w
         by_shift = np.einsum("nji,nj->ni", at.R, by_place)
@@ -139,7 +143,7 @@ class PathDensity:
         return DensitySlopes(
             cost=float(fit + np.log(np.diag(lower)).sum()),
             by_path=np.hstack([by_turn, by_shift]),
-            by_sensor=np.concatenate([lever.sum(axis=0), by_C.ravel(), by_H]),
+            by_sensor=np.concatenate([lever.sum(axis=0), by_own_C.sum(axis=0).ravel(), by_H]),
         )
 
     def weights(self, weights: FloatArray, sensor: FloatArray) -> WeightsOfPath:

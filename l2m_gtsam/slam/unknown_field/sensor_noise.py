@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from numba import njit
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import cholesky_banded
 
 from l2m_factors import N, SlowError, slow_bridge, slow_error_graph
 from l2m_gtsam.data import FloatArray, IntArray
@@ -176,6 +176,23 @@ class NoiseInformation:
 
     def __call__(self, rows: FloatArray) -> FloatArray:
         """Return the inverse times rows, shape (N, q)."""
-        white = self._white[:, None] * rows
-        slow = cho_solve_banded((self._lower, True), white)
-        return np.asarray(white - self._white[:, None] * slow)
+        slow = self._white[:, None] * rows
+        solve_tridiagonal(self._lower, slow)
+        return np.asarray(self._white[:, None] * (rows - slow))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve_tridiagonal(lower: FloatArray, rows: FloatArray) -> None:
+    """Write the solution over rows (N, q), for a Cholesky factor in its lower banded form, (2, N).
+
+    Row by row: LAPACK's takes a column after the other.
+    """
+    diagonal, below = lower
+    for n in range(len(rows)):
+        for c in range(rows.shape[1]):
+            before = below[n - 1] * rows[n - 1, c] if n else 0.0
+            rows[n, c] = (rows[n, c] - before) / diagonal[n]
+    for n in range(len(rows) - 1, -1, -1):
+        for c in range(rows.shape[1]):
+            after = below[n] * rows[n + 1, c] if n + 1 < len(rows) else 0.0
+            rows[n, c] = (rows[n, c] - after) / diagonal[n]

@@ -11,11 +11,9 @@ from l2m_factors import (
     ComplexityPenalty,
     KeyPoseReadings,
     M,
-    TileBatch,
+    ReadingErrors,
+    TileBlocks,
     WeightedField,
-    effective_parameters,
-    joint_residual,
-    tile_residual,
 )
 from l2m_gtsam.calibration.factor_graph import unit_priors
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray, chosen_rows, joined_rows
@@ -257,21 +255,27 @@ class TiledDrive:
             rows = np.intersect1d(tile.rows, chosen)
             graph.push_back(unit_priors({M(tile.number): len(tile.field)}))
             if len(rows):
-                readings = motions.readings[rows]
-                batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
-                for together in successive(batch.key_poses):
-                    residuals, doubtful = [], []
-                    for k in together:
-                        own = rows[batch.rows_of(k)]
-                        lasting, left = (None, None) if slow is None else slow.of(k, own)
-                        white = motions.whitening(own, whitening[own], by_lidar[own], left)
-                        step = motions.step_error(own, by_lidar[own])
-                        residuals.append(tile_residual(batch, k, white, step, lasting))
-                        doubt = effective_parameters(batch, k, penalty[batch.rows_of(k)])
-                        doubtful += [] if doubt is None else [doubt]
-                    graph.add(joint_residual(residuals).factor())
-                    if doubtful:
-                        doubts.add(joint_residual(doubtful).factor())
+                readings, W = motions.readings[rows], np.empty((len(rows), 3, 3))
+                errors = dict[int, ReadingErrors]()
+                for at in runs_of(readings.key_pose):
+                    k, own = int(readings.key_pose[at[0]]), rows[at]
+                    lasting, left = (None, None) if slow is None else slow.of(k, own)
+                    white = motions.whitening(own, whitening[own], by_lidar[own], left)
+                    step, W[at] = motions.step_error(own, by_lidar[own]), white.own
+                    errors[k] = ReadingErrors(white.common, step, lasting)
+                blocks = TileBlocks(tile.number, tile.anchor, tile.field, readings, W, fixed)
+                for together in successive(blocks.key_poses):
+                    own_errors = [errors[k] for k in together]
+                    graph.add(blocks.joint_residual(together, own_errors).factor())
+                    doubt = blocks.penalty(together, penalty)
+                    if doubt is not None:
+                        doubts.add(doubt.factor())
         if slow is not None:
             graph.push_back(slow.graph())
         return graph, doubts
+
+
+def runs_of(numbers: IntArray) -> list[IntArray]:
+    """Return where each of several numbers stands, ascending."""
+    order = np.argsort(numbers, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)
