@@ -35,6 +35,11 @@ from l2m_gtsam.maps.sources.source import SourceShape
 from l2m_gtsam.records.places import CLEAR, Cause, CauseGain, ChangedSource
 from l2m_gtsam.solve.linear_algebra import right_divided
 
+DETECTED_UT = 0.2  # weaker a source is not detected
+DETECTED_SHARE = 0.2  # of its strongest field: where a passage begins and ends
+APART = 30  # slots from one passage to the next
+REJECTED = 0.5  # share of the readings of an average, from which it disagrees
+
 
 @dataclass(frozen=True)
 class DriveSources:
@@ -134,12 +139,6 @@ def missed_by_map(shapes: Sequence[SourceShape], field_map: QueryableMap) -> Boo
         b, _ = shape.field_and_gradient(read.points)
         gains.append(float(np.sum(weight * b * (2 * lacking - b))))
     return np.array(gains) > CLEAR * variance
-
-
-DETECTED_UT = 0.2  # weaker a source is not detected
-DETECTED_SHARE = 0.2  # of its strongest field: where a passage begins and ends
-APART = 30  # slots from one passage to the next
-REJECTED = 0.5  # share of the readings of an average, from which it disagrees
 
 
 def changed_sources(

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from l2m_gtsam.data import FloatArray, IntArray
 
 LEFT_OUT = 1e-6  # of the least eigenvalue that is looked for
+ROWS = 192  # of a block: enough for a fast product, few enough to be of one place
 Product = Callable[[FloatArray], FloatArray]
 
 
@@ -232,9 +233,6 @@ def eigenpairs(product: Product, first: FloatArray, count: int) -> tuple[FloatAr
         vector = vector / beside[j]
     values, vectors = eigh_tridiagonal(diagonal[:count], beside[: count - 1])
     return np.asarray(values, dtype=np.float64), np.asarray(basis[:count].T @ vectors)
-
-
-ROWS = 192  # of a block: enough for a fast product, few enough to be of one place
 
 
 @dataclass(frozen=True)

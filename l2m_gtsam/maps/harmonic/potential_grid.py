@@ -34,6 +34,9 @@ DEGREE = 7
 WIDTH = DEGREE + 1  # coefficients per axis that a point needs
 BELOW = DEGREE // 2  # of them, those below the node at the lower side of the point's cell
 HALF_TAPS = 4  # values to each side that a coefficient needs
+MOST_NODES = 8_000_000  # 64 MB of coefficients, and four times as much while they are computed
+AROUND = WIDTH - 1 + 2 * HALF_TAPS  # nodes per axis that a cell needs beside its own
+EDGE = 1e-6  # cells: more than the rounding of a place that is just within reach
 
 
 def spline_values() -> FloatArray:
@@ -214,11 +217,6 @@ def spline_derivatives(
         spline_weights(fraction, weights)
         start = UNSIGNED(i) * step_x + UNSIGNED(j) * step_y + UNSIGNED(k)
         stencil_derivatives(flat, start, steps, weights, per_metre, per_area, field[n], gradient[n])
-
-
-MOST_NODES = 8_000_000  # 64 MB of coefficients, and four times as much while they are computed
-AROUND = WIDTH - 1 + 2 * HALF_TAPS  # nodes per axis that a cell needs beside its own
-EDGE = 1e-6  # cells: more than the rounding of a place that is just within reach
 
 
 @dataclass(frozen=True)

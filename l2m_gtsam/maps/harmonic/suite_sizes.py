@@ -70,6 +70,9 @@ JUDGED = (NAMES.index("C"), NAMES.index("H"))
 SMALLEST = 0.01  # of what was stated
 NOTHING = 1e-9  # of a variance: what rounding leaves of none
 LEAST_GAIN = 16.0  # twice a logarithm of likelihood; chance gives four sizes that in 0.1 % of maps
+# The first map takes the errors for noise and short waves; corrected by half of what they are, the
+# second shows them as they are.
+PASSES = 2
 
 
 @dataclass(frozen=True)
@@ -278,11 +281,6 @@ def tile_view(learnt: Learnt, tiles: Tiles, suite: SuiteErrors, index: int) -> T
 def sized(suite: SuiteErrors, sizes: SuiteSizes) -> SuiteErrors:
     """Return errors of a suite with these standard deviations."""
     return replace(suite, covariance=np.diag(np.tile(sizes.sigmas**2, len(suite.sensors))))
-
-
-# The first map takes the errors for noise and short waves; corrected by half of what they are, the
-# second shows them as they are.
-PASSES = 2
 
 
 def with_errors_found(

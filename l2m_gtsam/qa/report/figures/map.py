@@ -37,8 +37,8 @@ from l2m_gtsam.records.metrics import MapPicture, Metrics, Series
 from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.records.record import Row, Rows
 
-# Of colour bars: a drive is wider than high more often than not.
 CELLS = 240  # along the longer side of a map
+# Of colour bars: a drive is wider than high more often than not.
 BELOW: Any = {"location": "bottom", "shrink": 0.7, "aspect": 40, "pad": 0.02}
 
 
