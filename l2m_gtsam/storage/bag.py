@@ -25,8 +25,10 @@ from l2m_gtsam.storage.messages import (
     FieldBuffer,
     PoseBuffer,
     StampBuffer,
+    ends_of,
     frame_of,
     header_ns,
+    require_one_body,
     stamp_of,
     stamped_poses,
 )
@@ -201,11 +203,7 @@ def _add_poses(buffers: Buffers, message: Message, options: BagOptions) -> None:
     msgtype, record_ns = message.connection.msgtype, message.record_ns
     is_tf = msgtype in TF_TYPES
     for stamped, pose in stamped_poses(message.content, msgtype):
-        if is_tf:
-            ends = frame_of(stamped).lstrip("/"), pose.child_frame.lstrip("/")
-        else:
-            frame = frame_of(stamped) if hasattr(stamped, "header") else "map"
-            ends = frame, pose.child_frame or "lidar"
+        ends = ends_of(stamped, pose, msgtype)
         if ends not in buffers.poses:
             static = is_tf and "tf_static" in message.connection.topic
             buffers.poses[ends] = PoseBuffer(*ends, static=static)
@@ -255,9 +253,7 @@ def _single(path: Path, buffers: Buffers) -> Trajectory:
     """Return the poses of the one body that a topic tracks."""
     if not buffers.poses:
         raise BagError(f"{path}: the topic of the poses has no messages")
-    if len(buffers.poses) > 1:
-        ends = ", ".join(f"{parent} > {child}" for parent, child in sorted(buffers.poses)[:10])
-        raise BagError(f"{path}: the topic of the poses must track one body, it tracks: {ends}")
+    require_one_body(buffers.poses)
     (buffer,) = buffers.poses.values()
     return buffer.trajectory()
 

@@ -1,7 +1,7 @@
 """What is taken out of messages: one table of types, covariances, and growing buffers."""
 
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -173,6 +173,14 @@ def stamped_poses(content: Any, msgtype: str) -> Iterator[tuple[Any, RawPose]]:
         yield content, POSE_TYPES[msgtype](content)
 
 
+def ends_of(stamped: Any, pose: RawPose, msgtype: str) -> tuple[str, str]:
+    """Return the frames of a pose, parent and child."""
+    if msgtype in TF_TYPES:
+        return frame_of(stamped).lstrip("/"), pose.child_frame.lstrip("/")
+    frame = frame_of(stamped) if hasattr(stamped, "header") else "map"
+    return frame, pose.child_frame or "lidar"
+
+
 def px4_pose(position: Any, q: Any) -> RawPose:
     """Return a pose of PX4 in the axes of ROS (REP-103): east, north, up; forward, left, up.
 
@@ -264,6 +272,13 @@ class FieldBuffer:
     def field(self) -> FloatArray:
         """Return the readings as they were written, NaN for what no sensor reads, shape (N, 3)."""
         return readable(np.array(self.values, dtype=np.float64).reshape(-1, 3))
+
+
+def require_one_body(bodies: Collection[tuple[str, str]]) -> None:
+    """Raise a ValueError if a topic's poses are not those of one body, by parents and children."""
+    if len(bodies) > 1:
+        ends = ", ".join(f"{parent} > {child}" for parent, child in sorted(bodies)[:10])
+        raise ValueError(f"a topic must track one body, this tracks: {ends}")
 
 
 @dataclass

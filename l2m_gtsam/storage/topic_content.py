@@ -17,7 +17,9 @@ from l2m_gtsam.storage.messages import (
     FieldBuffer,
     PoseBuffer,
     StampBuffer,
+    ends_of,
     frame_of,
+    require_one_body,
     stamp_of,
     stamped_poses,
 )
@@ -61,6 +63,11 @@ class TopicContent:
 
 def pose_fault(bodies: Bodies, needed: set[str] | None) -> str:
     """Return what is wrong with the poses of a topic, of these frames alone if they are given."""
+    if needed is None:
+        try:
+            require_one_body(bodies)
+        except ValueError as error:
+            return str(error)
     for (_, child), buffer in sorted(bodies.items()):
         if needed is not None and child not in needed:
             continue
@@ -107,8 +114,7 @@ def _collect(
         into.stamps.add(stamp_of(stamped, record_ns), record_ns)
         into.frames.add(frame_of(stamped))
     for stamped, pose in stamped_poses(content, msgtype):
-        parent = frame_of(stamped).lstrip("/") if is_tf else ""
-        ends = parent, pose.child_frame.lstrip("/") if is_tf else pose.child_frame
+        ends = ends_of(stamped, pose, msgtype)
         body = into.bodies.setdefault(ends, PoseBuffer(*ends))
         body.add(stamp_of(stamped, record_ns), pose.position, pose.orientation)
         if pose.covariance is not None:
