@@ -1,18 +1,32 @@
 """Fixtures shared by all tests."""
 
+import gc
 import os
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from tests.support import kept
 from tests.support.browser_tools import find_tools
 from tests.support.repository import REPOSITORY
 
 # Machines are as fast as they are, and the first call of a compiled function compiles it.
 # Each run draws its own examples: fewer of them in a run, and many over the runs.
-settings.register_profile("l2m", deadline=None, max_examples=40)
+settings.register_profile("l2m", deadline=None, max_examples=30)
 settings.load_profile("l2m")
+
+
+def pytest_collection_finish() -> None:
+    """Take what was imported out of the garbage collector's rounds: a twentieth of the time."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _kept_by_this_run(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Let all workers of a run find what one of them has computed."""
+    kept.begin(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

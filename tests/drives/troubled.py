@@ -1,4 +1,4 @@
-"""Drives with troubles in one small hall, calibrated once for all tests.
+"""Drives with troubles in one small hall, calibrated once for all tests of a run.
 
 Sensors start near their places: how starts are found is not what these drives are for.
 """
@@ -19,6 +19,7 @@ from l2m_gtsam.records.verdict import Verdict
 from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 from l2m_gtsam.studies.troubles.surveys import TroubledPlace, troubled_place
+from tests.support.kept import kept
 
 OPTIONS = TroublesOptions(surveys=2, drives=1, survey_readings=900, readings=400)
 DRIVE = 1
@@ -26,11 +27,15 @@ DRIVE = 1
 
 @cache
 def hall(trouble: Trouble) -> TroubledPlace:
-    return troubled_place(OPTIONS, World.HALL, trouble, 0)
+    return kept(f"hall-{trouble}", lambda: troubled_place(OPTIONS, World.HALL, trouble, 0))
 
 
 @cache
 def drive(trouble: Trouble) -> tuple[Calibrated, tuple[KnownSensor, ...], Verdict]:
+    return kept(f"troubled-drive-{trouble}", lambda: _drive(trouble))
+
+
+def _drive(trouble: Trouble) -> tuple[Calibrated, tuple[KnownSensor, ...], Verdict]:
     place = hall(Trouble.SUITE if trouble.wrong_suite else Trouble.CLEAN)
     recording, truth = troubled_drive(OPTIONS, place, trouble, DRIVE)
     found, verdict = judged(place, recording, truth)

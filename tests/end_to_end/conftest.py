@@ -35,7 +35,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     folder = tmp_path_factory.mktemp("demo")
     options = folder / "hall.yaml"
     options.write_text(json.dumps(SMALL_HALL))  # JSON is YAML
-    with computed_once(tmp_path_factory):
+    with computed_once():
         return Demo(folder, l2m("demo", "--options", options, "--out", folder).out)
 
 

@@ -49,11 +49,9 @@ def named(page: Path) -> str:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _maps_and_calibrations_are_computed_once(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[None]:
+def _maps_and_calibrations_are_computed_once() -> Iterator[None]:
     """Several pages build the same map and calibrate the same drive: the first does it for all."""
-    with computed_once(tmp_path_factory):
+    with computed_once():
         yield
 
 

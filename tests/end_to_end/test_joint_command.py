@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import pytest
-
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.record_files import read_metrics
 from tests.drives.begun import begin
@@ -24,14 +22,12 @@ def test_bags_that_are_missing_or_given_twice(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_two_real_drives(
-    shared_data: Path, tmp_path: Path, repository: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_two_real_drives(shared_data: Path, tmp_path: Path, repository: Path) -> None:
     """A handheld sensor under a motion-capture system, on the map of the first drive."""
     bags, config = shared_data / "bags", repository / "configs" / "optitrack.yaml"
     first, second = bags / "optitrack_run0_ros1.bag", bags / "optitrack_run1_ros1.bag"
     map_path, out = tmp_path / "map.npz", tmp_path / "out"
-    with computed_once(tmp_path_factory):  # the map of test_optitrack_commands.py
+    with computed_once():  # the map of test_optitrack_commands.py
         l2m("map", "build", first, "--config", config, "--out", map_path)
     first, second = (begin(each, tmp_path / each.name, SECONDS) for each in (first, second))
     l2m("calibrate", second, "--bag", first, "--map", map_path, "--config", config, "--out", out)

@@ -19,7 +19,7 @@ def optitrack(
     folder = tmp_path_factory.mktemp("optitrack")
     bags, config = shared_data / "bags", repository / "configs" / "optitrack.yaml"
     survey, map_path = bags / "optitrack_run0_ros2_sqlite", folder / "map.npz"
-    with computed_once(tmp_path_factory):  # another container of this run is mapped elsewhere
+    with computed_once():  # another container of this run is mapped elsewhere
         l2m("map", "build", survey, "--config", config, "--out", map_path)
     wanted = ("--config", config, "--out", folder / "result", "--rerun", folder / "view.rrd")
     run = l2m("calibrate", bags / "optitrack_run1_ros1.bag", "--map", map_path, *wanted)

@@ -5,11 +5,9 @@ not computed again.
 """
 
 import hashlib
-import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import TypeVar, cast
 
 import pytest
@@ -25,27 +23,20 @@ from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.field_map import FieldMap, Summarised
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.upkeep.surveys import map_surveys
-from tests.support.made_once import made_once
+from tests.support.kept import kept
 
 Found = TypeVar("Found")
-KEPT = "kept.pickle"
 
 
 @contextmanager
-def computed_once(factory: pytest.TempPathFactory) -> Iterator[None]:
+def computed_once() -> Iterator[None]:
     """Compute a map of a survey, and a calibration of a drive on a map, once for all workers."""
     here: dict[str, object] = {}
 
     def once(key: object, compute: Callable[[], Found]) -> Found:
-        name = f"computed-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}"
-
-        def keep(folder: Path) -> None:
-            here[name] = compute()
-            (folder / KEPT).write_bytes(pickle.dumps(here[name]))
-
-        folder = made_once(factory, name, keep)
-        if name not in here:  # another worker computed it; our own has opened tiles
-            here[name] = pickle.loads((folder / KEPT).read_bytes())  # noqa: S301 - our own
+        name = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+        if name not in here:  # with the tiles that it has opened
+            here[name] = kept(name, compute)
         return cast("Found", here[name])
 
     def mapped(
