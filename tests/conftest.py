@@ -13,7 +13,7 @@ from tests.support.repository import REPOSITORY
 
 # Machines are as fast as they are, and the first call of a compiled function compiles it.
 # Each run draws its own examples: fewer of them in a run, and many over the runs.
-settings.register_profile("l2m", deadline=None, max_examples=30)
+settings.register_profile("l2m", deadline=None, max_examples=40)
 settings.load_profile("l2m")
 
 

@@ -1,6 +1,6 @@
 """What the readings of a block, those on several key poses, have in common beside their noise."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -38,15 +38,6 @@ class ReadingErrors:
         return ReadingErrors(common, self.step.checked(count), slow)
 
 
-@dataclass(frozen=True)
-class BlockDerivative:
-    """Derivatives of the readings at some rows by a variable, shape (n, 3, .)."""
-
-    key: int
-    at: slice
-    value: FloatArray
-
-
 class BlockErrors:
     """Errors of n readings on successive key poses, white by the noise of each reading.
 
@@ -68,44 +59,49 @@ class BlockErrors:
     def __init__(
         self, runs: Sequence[slice], errors: Sequence[ReadingErrors], whitening: FloatArray
     ) -> None:
-        self._runs, self._W = tuple(runs), whitening
-        self._errors = [
-            white(each.checked(at.stop - at.start), whitening[at])
-            for at, each in zip(runs, errors, strict=True)
-        ]
-        every = [key for each in self._errors for key in each.step.keys]
-        every += [key for each in self._errors if each.slow is not None for key in each.slow.keys]
-        self.keys = list(dict.fromkeys(every))
+        self._count = len(whitening)
+        self._steps: list[tuple[slice, StepError]] = []
+        self._common: list[tuple[slice, FloatArray]] = []
+        self._by_slow: list[tuple[slice, int, FloatArray]] = []  # which, a key, and (n, 3, 3)
+        for at, each in zip(runs, errors, strict=True):
+            own, W = each.checked(at.stop - at.start), whitening[at]
+            self._steps.append((at, replace(own.step, slope=W @ own.step.slope)))
+            self._common += [(at, own.common)] if own.common.shape[1] else []
+            if own.slow is not None:
+                shares = zip(own.slow.keys, own.slow.shares.T, strict=True)
+                self._by_slow += [(at, key, share[:, None, None] * W) for key, share in shares]
+        of_steps = [key for _, step in self._steps for key in step.keys]
+        self.keys = list(dict.fromkeys([*of_steps, *(key for _, key, _ in self._by_slow)]))
 
     def residual(self, values: gtsam.Values) -> FloatArray:
         """Return what the errors add, before ``project``, shape (n, 3)."""
-        added = np.empty((len(self._W), AXES))
-        for at, each in zip(self._runs, self._errors, strict=True):
-            added[at] = each.step.residual(values)
-            if each.slow is not None:
-                own = self._W[at] @ each.slow.residual(values)[:, :, None]
-                added[at] += own[:, :, 0]
+        added = np.empty((self._count, AXES))
+        for at, step in self._steps:
+            added[at] = step.residual(values)
+        for at, key, block in self._by_slow:
+            added[at] += block @ values.atVector(key)
         return added
 
-    def jacobians(self, values: gtsam.Values) -> Iterator[BlockDerivative]:
-        """Yield its derivatives; those at the same rows by the same variable add up."""
-        for at, each in zip(self._runs, self._errors, strict=True):
-            terms = [(each.step.keys, each.step.jacobians(values))]
-            if each.slow is not None:
-                by_slow = [self._W[at] @ block for block in each.slow.jacobians(values)]
-                terms.append((each.slow.keys, by_slow))
-            for keys, blocks in terms:
-                for key, block in zip(keys, blocks, strict=True):
-                    yield BlockDerivative(key, at, block)
+    def added(
+        self, derivatives: dict[int, FloatArray], values: gtsam.Values
+    ) -> dict[int, FloatArray]:
+        """Return derivatives of the n readings by variables, (n, 3, .), with those of the errors.
+
+        Those given are changed.
+        """
+        parts = [
+            (at, *each)
+            for at, step in self._steps
+            for each in zip(step.keys, step.jacobians(values), strict=True)
+        ]
+        for at, key, block in [*parts, *self._by_slow]:
+            if key not in derivatives:
+                derivatives[key] = np.zeros((self._count, AXES, block.shape[2]))
+            derivatives[key][at] += block
+        return derivatives
 
     def project(self, rows: FloatArray) -> None:
         """Write over rows, (n, 3, k), what is left of them without the common errors."""
-        for at, each in zip(self._runs, self._errors, strict=True):
-            if each.common.shape[1]:
-                own = rows[at].reshape(len(each.common), -1)
-                own -= each.common @ (each.common.T @ own)
-
-
-def white(errors: ReadingErrors, whitening: FloatArray) -> ReadingErrors:
-    """Return errors whose step has made its slope white."""
-    return replace(errors, step=replace(errors.step, slope=whitening @ errors.step.slope))
+        for at, common in self._common:
+            own = rows[at].reshape(len(common), -1)
+            own -= common @ (common.T @ own)

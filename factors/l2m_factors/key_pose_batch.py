@@ -17,6 +17,8 @@ from l2m_factors.key_pose_readings import (
 from l2m_factors.keys import D, S, T
 from l2m_factors.residual import ReadingResiduals
 
+LEAST = 5e-324  # GTSAM takes doubles for equal that differ by less than a tolerance
+
 
 class SensorVariables:
     """The calibrations that readings on key poses depend on.
@@ -192,11 +194,15 @@ class KeyPoseBatch(ABC):
 
         Those of key poses without values mean nothing, as when one factor is used alone.
         """
-        last, keys = self._last, self._keys_asked(key_pose)
+        return self._evaluation(values, self._keys_asked(key_pose)).residuals
+
+    def _evaluation(self, values: gtsam.Values, keys: list[int]) -> KeyPoseEvaluation:
+        """Return the last evaluation, or another if any of these variables has changed."""
+        last = self._last
         if last is None or not are_same(values, last.at, keys):
             last = KeyPoseEvaluation(self._extracted(values), self._evaluated(values))
             self._last = last
-        return last.residuals
+        return last
 
     @abstractmethod
     def _pose(self, values: gtsam.Values, key_pose: int) -> gtsam.Pose3:
@@ -265,6 +271,6 @@ def are_same(values: gtsam.Values, others: gtsam.Values, keys: list[int]) -> boo
     """
     own = values.extract(keys)
     try:
-        return bool(own.equals(others.extract(keys), 0.0))
+        return bool(own.equals(others.extract(keys), LEAST))
     except RuntimeError:  # others have not all of them
         return False

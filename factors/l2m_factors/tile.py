@@ -191,16 +191,20 @@ class TileBatch(KeyPoseBatch):
         drive's together are as large as its linear system.
         """
         if key_pose not in self._by_weights:
-            every = self._derivatives_by_weights()
+            every = self._derivatives_by_weights(np.arange(len(self)))
             self._by_weights = {k: every[rows] for k, rows in self._rows.items()}
         return self._by_weights.pop(key_pose)
 
-    def _derivatives_by_weights(self) -> FloatArray:
-        """Return derivatives by the weights where all N residuals were evaluated, (N, 3, m)."""
-        where, known = self._places_at(*self._point), self._point[2]
-        C = known.distortion[self._readings.sensor, :9].reshape(-1, 3, 3)
+    def _derivatives_by_weights(self, rows: npt.NDArray[np.int64]) -> FloatArray:
+        """Return derivatives by the weights where n residuals were evaluated, (n, 3, m)."""
+        where, known = self._evaluated_places()[rows], self._point[2]
+        C = known.distortion[self._readings.sensor[rows], :9].reshape(-1, 3, 3)
         turned = C @ where.R_anchor_lidar.transpose(0, 2, 1)
         return np.asarray(turned @ self._tile.features(where.x))
+
+    def _evaluated_places(self) -> TilePlaces:
+        """Return where all N readings are where residuals were evaluated last."""
+        return self._places_at(*self._point)
 
     def _places_at(self, R: FloatArray, p: FloatArray, known: Calibrations) -> TilePlaces:
         """Return where all N readings are, from the key pose of each and the sensors."""

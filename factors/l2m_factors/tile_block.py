@@ -1,13 +1,12 @@
 """Readings of a tile on several key poses as one factor, evaluated and made white all at once.
 
-A graph that is solved again and again as a drive goes on, with the calibrations of a dozen
-sensors as variables, spends its time in Python: with ``tile_factor`` each key pose asks for two
-dozen values to see whether they changed, and puts together as many blocks of derivatives. Here a
-factor asks once for all readings of the tile, and takes its rows from what was made for all.
+A graph of many readings spends its time in Python: with ``tile_factor`` each key pose asks for its
+values to see whether they changed, and puts together as many blocks of derivatives. Here a factor
+asks once for several key poses, and takes its rows from what was made for all of the tile.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -18,7 +17,6 @@ from l2m_factors.block_errors import BlockErrors, ReadingErrors
 from l2m_factors.complexity import ComplexityPenalty
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.joint_residual import Residual
-from l2m_factors.key_pose_batch import are_same
 from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
 from l2m_factors.keys import M, X
 from l2m_factors.motion import skew
@@ -137,8 +135,6 @@ class TileBlocks(TileBatch):
         super().__init__(number, anchor, field, readings, fixed)
         self._W = numbers("whitening", whitening, (len(readings), 3, 3))
         self._on_anchor = self._rows.get(anchor, np.empty(0, dtype=np.int64))
-        self._evaluated_at = gtsam.Values()
-        self._found: KeyPoseResiduals
         self._white: FloatArray
         self._where: TilePlaces
         self._of_readings: TileDerivatives | None = None
@@ -151,7 +147,9 @@ class TileBlocks(TileBatch):
         for first in range(0, len(sensors), few):
             yield self._residual(key_poses, sensors[first : first + few])
 
-    def joint_residual(self, key_poses: Sequence[int], errors: Sequence[ReadingErrors]) -> Residual:
+    def residual_with_errors(
+        self, key_poses: Sequence[int], errors: Sequence[ReadingErrors]
+    ) -> Residual:
         """Return the white residual of the readings on some key poses, which share errors.
 
         It is that of ``tile_residual`` for each, one after the other.
@@ -178,20 +176,17 @@ class TileBlocks(TileBatch):
         keys = list(dict.fromkeys([*block.keys, *shared.keys]))
 
         def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
-            self._evaluate(values, block.keys)
+            found = self._evaluation(values, block.keys).residuals
             e = (self._white[block.rows] + shared.residual(values))[:, :, None]
             shared.project(e)
             if jacobians is not None:
-                every = self._reading_derivatives()[block.rows]
-                sums = dict(zip(block.keys, block.derivatives(every), strict=True))
-                for each in shared.jacobians(values):
-                    if each.key not in sums:
-                        sums[each.key] = np.zeros((len(e), 3, each.value.shape[2]))
-                    sums[each.key][each.at] += each.value
-                every_block = np.concatenate([sums[key] for key in keys], axis=2)
-                shared.project(every_block)
-                ends = np.cumsum([sums[key].shape[2] for key in keys[:-1]])
-                parts = np.split(every_block.reshape(3 * len(e), -1), ends, axis=1)
+                own = block.derivatives(self._reading_derivatives(found, block.rows))
+                by_key = shared.added(dict(zip(block.keys, own, strict=True)), values)
+                # Side by side, so that all are freed of the common errors at once.
+                whole = np.concatenate([by_key[key] for key in keys], axis=2)
+                shared.project(whole)
+                edges = np.cumsum([by_key[key].shape[2] for key in keys[:-1]])
+                parts = np.split(whole.reshape(e.size, -1), edges, axis=1)
                 for slot, part in enumerate(parts):
                     jacobians[slot] = part
             return e.ravel()
@@ -213,9 +208,11 @@ class TileBlocks(TileBatch):
         if not block.keys:
             return None
         own = every[block.rows]
+        # Places depend on time offsets, too, though a penalty has no derivative by them.
+        asked = list(dict.fromkeys(key for k in key_poses for key in self._keys_asked(k)))
 
         def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
-            self._evaluate(values, block.keys)
+            self._evaluation(values, asked)
             if jacobians is not None:
                 block.fill(jacobians, self._place_derivatives()[block.rows].along(own.slope))
             away = self._where.x[block.rows] - own.at
@@ -231,9 +228,9 @@ class TileBlocks(TileBatch):
         block = self._block(key_poses, keys, sensors)
 
         def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
-            self._evaluate(values, block.keys)
+            found = self._evaluation(values, block.keys).residuals
             if jacobians is not None:
-                block.fill(jacobians, self._reading_derivatives()[block.rows])
+                block.fill(jacobians, self._reading_derivatives(found, block.rows))
             return self._white[block.rows].ravel()
 
         return Residual(block.keys, 3 * len(block.rows), error)
@@ -255,30 +252,31 @@ class TileBlocks(TileBatch):
             tuple(np.flatnonzero(sensor == each) for each in free),
         )
 
-    def _evaluate(self, values: gtsam.Values, keys: list[int]) -> None:
-        """Evaluate all readings, if any of these variables has changed."""
-        if are_same(values, self._evaluated_at, keys):
-            return
-        at = self._extracted(values)
-        self._found = self._evaluated(values)
+    def _evaluated(self, values: gtsam.Values) -> KeyPoseResiduals:
+        found = super()._evaluated(values)
         self._where = self._places_at(*self._point)
-        self._white = np.einsum("nij,nj->ni", self._W, self._found.reading.residual)
+        self._white = np.einsum("nij,nj->ni", self._W, found.reading.residual)
         self._of_readings = self._of_places = None
-        self._evaluated_at = at
+        return found
 
-    def _reading_derivatives(self) -> TileDerivatives:
-        """Return derivatives of the white residuals where they were evaluated."""
+    def _reading_derivatives(
+        self, found: KeyPoseResiduals, rows: npt.NDArray[np.int64]
+    ) -> TileDerivatives:
+        """Return derivatives of white residuals, those of all readings, at some rows.
+
+        Those by the weights are made for these rows alone: of a whole drive they are as large as
+        its linear system.
+        """
         if self._of_readings is None:
-            reading, by_key = self._found.reading, self._W @ self._found.de_dX
+            reading, by_key = found.reading, self._W @ found.de_dX
             by_sensor = [reading.de_dt, reading.de_dD]
             by_sensor += [reading.de_dS] if self._variables.timed else []
+            by_sensor_white = tuple(self._W @ each for each in by_sensor)
             self._of_readings = TileDerivatives(
-                by_key,
-                self._by_anchor(by_key),
-                self._W @ self._derivatives_by_weights(),
-                tuple(self._W @ each for each in by_sensor),
+                by_key, self._by_anchor(by_key), None, by_sensor_white
             )
-        return self._of_readings
+        own = self._of_readings[rows]
+        return replace(own, by_weights=self._W[rows] @ self._derivatives_by_weights(rows))
 
     def _place_derivatives(self) -> TileDerivatives:
         """Return derivatives of places in the anchor's frame, without time offsets."""
@@ -286,6 +284,9 @@ class TileBlocks(TileBatch):
             by_key, by_sensor = self._where.by_key, (self._where.R_anchor_lidar,)
             self._of_places = TileDerivatives(by_key, self._by_anchor(by_key), None, by_sensor)
         return self._of_places
+
+    def _evaluated_places(self) -> TilePlaces:
+        return self._where
 
     def _by_anchor(self, by_key: FloatArray) -> FloatArray:
         """Return derivatives by the anchor's pose from those by each key pose, (N, q, 6)."""

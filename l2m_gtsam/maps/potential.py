@@ -118,6 +118,9 @@ class PotentialBasis:
         by_features
             Its derivative by the features there, shape (N, 3, m).
         """
+        if by_features.shape != (len(points), AXES, len(self)):
+            msg = f"by_features: {by_features.shape}; needed is {(len(points), AXES, len(self))}"
+            raise ValueError(msg)
         found = np.empty((len(points), AXES))
         which = self._distinct.which
         write_by_points(*self._sines(points), which, self.waves, by_features, found)
@@ -125,8 +128,10 @@ class PotentialBasis:
 
     def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, of weights of shape (m,)."""
-        field, gradient = np.empty((len(points), AXES)), np.empty((len(points), AXES, AXES))
         which, w = self._distinct.which, np.asarray(weights, dtype=np.float64)
+        if w.shape != (len(self),):
+            raise ValueError(f"weights: {w.shape}; needed is {(len(self),)}")
+        field, gradient = np.empty((len(points), AXES)), np.empty((len(points), AXES, AXES))
         write_field(*self._sines(points), which, self.waves, w, field, gradient)
         return field, gradient
 

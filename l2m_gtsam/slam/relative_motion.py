@@ -144,12 +144,18 @@ class DrivePrediction:
         prediction, squared = self.prediction, np.zeros(len(used))
         own = prediction.whitening(noise)
         rows = np.flatnonzero(used & prediction.inside)
-        key = self.motions.readings.key_pose[rows]
-        for part in np.split(rows, np.flatnonzero(np.diff(key)) + 1) if len(rows) else ():
+        for at in by_key_pose(self.motions.readings.key_pose[rows]):
+            part = rows[at]
             white = self.motions.whitening(part, own[part], prediction.by_lidar[part])
             e = white(prediction.residual[part, :, None]).reshape(-1, 3)
             squared[part] = np.einsum("ni,ni->n", e, e)
         return squared
+
+
+def by_key_pose(key_pose: IntArray) -> list[IntArray]:
+    """Return the rows of each key pose, one after the other, from those of n readings in order."""
+    rows = np.arange(len(key_pose))
+    return np.split(rows, np.flatnonzero(np.diff(key_pose)) + 1) if len(rows) else []
 
 
 def interpolated_readings(

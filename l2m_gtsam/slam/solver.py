@@ -33,8 +33,8 @@ from l2m_gtsam.calibration.optimise import (
 from l2m_gtsam.slam.marginals import unless_indeterminate
 
 LAST = (ord("T"), ord("D"), ord("V"))
-# Of the first step, and the least: weights and slow errors have a prior of 1, all others are known
-# better. From 1e-10, where GTSAM comes after some good steps, seven are tried before the next.
+# Of the first step, and the least: it changes steps, not the minimum. From 1e-10, where GTSAM comes
+# after some good steps, seven are tried before the next good one: a sixth of the time on the ship.
 DAMPING = 1e-3
 
 

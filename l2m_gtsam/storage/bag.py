@@ -25,10 +25,10 @@ from l2m_gtsam.storage.messages import (
     FieldBuffer,
     PoseBuffer,
     StampBuffer,
+    bodies_fault,
     ends_of,
     frame_of,
     header_ns,
-    require_one_body,
     stamp_of,
     stamped_poses,
 )
@@ -253,7 +253,8 @@ def _single(path: Path, buffers: Buffers) -> Trajectory:
     """Return the poses of the one body that a topic tracks."""
     if not buffers.poses:
         raise BagError(f"{path}: the topic of the poses has no messages")
-    require_one_body(buffers.poses)
+    if wrong := bodies_fault(buffers.poses):
+        raise ValueError(wrong)
     (buffer,) = buffers.poses.values()
     return buffer.trajectory()
 

@@ -174,11 +174,19 @@ def stamped_poses(content: Any, msgtype: str) -> Iterator[tuple[Any, RawPose]]:
 
 
 def ends_of(stamped: Any, pose: RawPose, msgtype: str) -> tuple[str, str]:
-    """Return the frames of a pose, parent and child."""
+    """Return the frames of a pose, parent and child; "map" and "lidar" where it names none."""
     if msgtype in TF_TYPES:
         return frame_of(stamped).lstrip("/"), pose.child_frame.lstrip("/")
     frame = frame_of(stamped) if hasattr(stamped, "header") else "map"
     return frame, pose.child_frame or "lidar"
+
+
+def bodies_fault(bodies: Collection[tuple[str, str]]) -> str:
+    """Return what is wrong with poses on one topic, by parent and child, if not of one body."""
+    if len(bodies) <= 1:
+        return ""
+    ends = ", ".join(f"{parent} > {child}" for parent, child in sorted(bodies)[:10])
+    return f"a topic must track one body, this tracks: {ends}"
 
 
 def px4_pose(position: Any, q: Any) -> RawPose:
@@ -272,13 +280,6 @@ class FieldBuffer:
     def field(self) -> FloatArray:
         """Return the readings as they were written, NaN for what no sensor reads, shape (N, 3)."""
         return readable(np.array(self.values, dtype=np.float64).reshape(-1, 3))
-
-
-def require_one_body(bodies: Collection[tuple[str, str]]) -> None:
-    """Raise a ValueError if a topic's poses are not those of one body, by parents and children."""
-    if len(bodies) > 1:
-        ends = ", ".join(f"{parent} > {child}" for parent, child in sorted(bodies)[:10])
-        raise ValueError(f"a topic must track one body, this tracks: {ends}")
 
 
 @dataclass

@@ -17,9 +17,9 @@ from l2m_gtsam.storage.messages import (
     FieldBuffer,
     PoseBuffer,
     StampBuffer,
+    bodies_fault,
     ends_of,
     frame_of,
-    require_one_body,
     stamp_of,
     stamped_poses,
 )
@@ -63,11 +63,8 @@ class TopicContent:
 
 def pose_fault(bodies: Bodies, needed: set[str] | None) -> str:
     """Return what is wrong with the poses of a topic, of these frames alone if they are given."""
-    if needed is None:
-        try:
-            require_one_body(bodies)
-        except ValueError as error:
-            return str(error)
+    if needed is None and (wrong := bodies_fault(bodies)):
+        return wrong
     for (_, child), buffer in sorted(bodies.items()):
         if needed is not None and child not in needed:
             continue

@@ -133,9 +133,11 @@ def graph_of(batch: MapBatch) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def test_one_map_query_when_all_poses_move() -> None:
+@pytest.mark.parametrize("timed", [False, True])
+def test_one_map_query_when_all_poses_move(timed: bool) -> None:
     counting, values = CountingWorld(dipole_world(2)), values_for(2, key_poses=5)
-    graph = graph_of(MapBatch(counting, random_carried(2, key_poses=5)))
+    readings = random_carried(2, key_poses=5)
+    graph = graph_of(MapBatch(counting, with_motion(readings, 2) if timed else readings))
     graph.error(values)
     graph.linearize(values)
     assert counting.calls == 1

@@ -21,6 +21,8 @@ def begin(factory: pytest.TempPathFactory) -> None:
 
 def kept(name: str, compute: Callable[[], Result]) -> Result:
     """Return a result by its name, a part of a path; the worker that asks first computes it."""
+    if not _factories:
+        raise RuntimeError("kept: no run of the tests has begun; tests/conftest.py begins one")
     here: list[Result] = []
 
     def make(folder: Path) -> None:

@@ -20,7 +20,7 @@ from l2m_gtsam.data import FieldSample, FloatArray, IntArray, chosen_rows, joine
 from l2m_gtsam.slam.drive import KnownSensors, stacked
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, predict
 from l2m_gtsam.slam.pose_graph import successive
-from l2m_gtsam.slam.relative_motion import RelativeMotions
+from l2m_gtsam.slam.relative_motion import RelativeMotions, by_key_pose
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.unknown_field.linear_field import AXES, LinearField
 from l2m_gtsam.slam.unknown_field.revisited_tiles import RevisitedTiles
@@ -257,7 +257,7 @@ class TiledDrive:
             if len(rows):
                 readings, W = motions.readings[rows], np.empty((len(rows), 3, 3))
                 errors = dict[int, ReadingErrors]()
-                for at in runs_of(readings.key_pose):
+                for at in by_key_pose(readings.key_pose):
                     k, own = int(readings.key_pose[at[0]]), rows[at]
                     lasting, left = (None, None) if slow is None else slow.of(k, own)
                     white = motions.whitening(own, whitening[own], by_lidar[own], left)
@@ -266,16 +266,10 @@ class TiledDrive:
                 blocks = TileBlocks(tile.number, tile.anchor, tile.field, readings, W, fixed)
                 for together in successive(blocks.key_poses):
                     own_errors = [errors[k] for k in together]
-                    graph.add(blocks.joint_residual(together, own_errors).factor())
+                    graph.add(blocks.residual_with_errors(together, own_errors).factor())
                     doubt = blocks.penalty(together, penalty)
                     if doubt is not None:
                         doubts.add(doubt.factor())
         if slow is not None:
             graph.push_back(slow.graph())
         return graph, doubts
-
-
-def runs_of(numbers: IntArray) -> list[IntArray]:
-    """Return where each of several numbers stands, ascending."""
-    order = np.argsort(numbers, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)

@@ -16,7 +16,7 @@ from tests.drives.slam import rounds
 from tests.support.pose_errors import mean_nees
 from tests.worlds.exact import dipole_world, random_sensors
 
-SEEDS = range(4)
+SEEDS = range(6)
 EXACT = np.full(15, 1e-6)
 ALIKE = DriftOptions(position_share=0.03, rotation_deg_per_m=0.2, steady=0.0)
 LEVEL = ALIKE.model_copy(update={"height_share": 0.0, "tilt_deg_per_m": 0.0})

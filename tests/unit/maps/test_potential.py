@@ -25,6 +25,29 @@ def test_gradient_is_that_of_the_field_and_symmetric(seed: int) -> None:
     assert np.abs(curl).max() < 1e-12 * np.abs(gradient).max()
 
 
+@given(seed=st.integers(0, 2**31), count=st.integers(0, 4))
+def test_field_features_and_slopes_are_of_one_field(seed: int, count: int) -> None:
+    """Each is computed by itself; rounding of sums over 63 weights."""
+    rng = np.random.default_rng(seed)
+    basis = PotentialBasis.over(LOW, HIGH, PRIOR, 60)
+    points, weights = rng.uniform(LOW, HIGH, (count, 3)), rng.normal(size=len(basis))
+    features, by_x = basis.features(points), basis.slopes(points)
+    field, gradient = basis.field_and_gradient(points, weights)
+    np.testing.assert_allclose(features @ weights, field, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(by_x @ weights, gradient, rtol=0, atol=1e-10)
+    by_features = rng.normal(size=features.shape)
+    expected = np.einsum("nam,naim->ni", by_features, by_x)
+    np.testing.assert_allclose(basis.by_points(points, by_features), expected, rtol=0, atol=1e-10)
+
+
+def test_weights_and_features_of_another_size_are_refused() -> None:
+    basis, points = PotentialBasis.over(LOW, HIGH, PRIOR, 60), np.zeros((2, 3))
+    with pytest.raises(ValueError, match=r"^weights: \(5,\); needed is \(63,\)$"):
+        basis.field_and_gradient(points, np.ones(5))
+    with pytest.raises(ValueError, match=r"^by_features: \(1, 3, 63\); needed is \(2, 3, 63\)$"):
+        basis.by_points(points, np.ones((1, 3, 63)))
+
+
 @given(st.tuples(*[st.floats(0.5, 20.0)] * 3), st.integers(1, 25))
 def test_waves_are_the_smallest(size: tuple[float, ...], count: int) -> None:
     edges = np.array(size)
