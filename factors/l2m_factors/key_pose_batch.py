@@ -1,6 +1,7 @@
 """Readings that hang on key poses, evaluated together and again only when variables change."""
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import NamedTuple
 
 import gtsam
@@ -172,7 +173,6 @@ class KeyPoseBatch(ABC):
         self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}
         self._every_sensor = self._variables.on(np.arange(len(readings)))
         self._asked: dict[int, list[int]] = {}  # keys that readings on a key pose depend on
-        self._every_key: list[int] | None = None
         self._last: KeyPoseEvaluation | None = None
 
     def __len__(self) -> int:
@@ -226,14 +226,16 @@ class KeyPoseBatch(ABC):
             self._asked[key_pose] = [*self._own_keys([key_pose]), *of_sensors]
         return self._asked[key_pose]
 
+    @cached_property
+    def _every_key(self) -> list[int]:
+        of_sensors = self._variables.keys(self._every_sensor)
+        return [*self._own_keys(list(self._rows)), *of_sensors]
+
     def _extracted(self, values: gtsam.Values) -> gtsam.Values:
         """Return all variables that the readings depend on, as far as they are there.
 
         On line some sensors come late, and a factor may be asked alone.
         """
-        if self._every_key is None:
-            of_sensors = self._variables.keys(self._every_sensor)
-            self._every_key = [*self._own_keys(list(self._rows)), *of_sensors]
         try:
             return values.extract(self._every_key)
         except RuntimeError:
