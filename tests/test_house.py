@@ -72,4 +72,4 @@ def test_no_class_name_stands_for_two_things(repository: Path) -> None:
 def test_few_modules_lie_outside_of_packages(repository: Path) -> None:
     """What belongs to a topic is in its package: the root has what all packages share."""
     modules = {file.stem for file in (repository / "l2m_gtsam").glob("*.py")} - {"__init__"}
-    assert modules == {"config", "data", "errors", "geometry", "options", "progress"}
+    assert modules == {"config", "errors", "geometry", "options", "progress"}
