@@ -1,6 +1,7 @@
 """The verdict on a localisation: PASS, WARN or FAIL, with reasons in plain sentences."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,6 +33,42 @@ EXACT = 1e-6  # m and degrees: smaller standard deviations count as this
 MOST = 0.5  # share of a sensor's readings in a span of the timeline
 
 
+@dataclass(frozen=True)
+class FieldWording:
+    """How sentences speak of the field that readings are compared with.
+
+    Attributes
+    ----------
+    compared
+        Which readings do not fit it.
+    expected
+        What it is called.
+    changed
+        Why readings may fit no place.
+    inexact
+        Why it may fit less well than it states.
+    """
+
+    compared: str
+    expected: str
+    changed: str
+    inexact: str
+
+
+IN_MAP = FieldWording(
+    compared="of its readings inside the map do not fit it",
+    expected="map",
+    changed="the place has changed since it was mapped, or something passed by",
+    inexact="the map is less exact than it states",
+)
+WITHOUT_MAP = FieldWording(
+    compared="of its readings do not fit the field of the others",
+    expected="the estimated field",
+    changed="steel was moved during the drive, or something passed by",
+    inexact="its noise is stated too small",
+)
+
+
 def judge_localisation(record: LocalisationRecord, options: QaOptions) -> Verdict:
     """Return the verdict with its reasons.
 
@@ -47,7 +84,10 @@ def judge_localisation(record: LocalisationRecord, options: QaOptions) -> Verdic
     sensors = [
         SensorVerdict.of(
             each.use.sensor,
-            [*_counted(each, options), *_refined(refined.get(each.use.sensor), options.slam)],
+            [
+                *_counted(each, options, _wording(record)),
+                *_refined(refined.get(each.use.sensor), options.slam),
+            ],
         )
         for each in record.sensors
     ]
@@ -203,8 +243,8 @@ def _changed(record: LocalisationRecord, path: LocalisedTrajectory) -> list[Reas
         here, there = ("({:.1f}, {:.1f})".format(*path.place_at(each)) for each in (start, end))
         reasons += warning(
             f"From {start:.0f} to {end:.0f} s, between {here} and {there} m, most "
-            "readings of all sensors fit no place where the vehicle can have been: the place "
-            "has changed since it was mapped, or something passed by."
+            "readings of all sensors fit no place where the vehicle can have been: "
+            f"{_wording(record).changed}."
         )
     if len(found) > MANY:
         reasons += warning(f"The same is true of {len(found) - MANY} more stretches.")
@@ -269,7 +309,11 @@ def _turn(turn: OdometryTurn) -> list[Reason]:
     )
 
 
-def _counted(sensor: SensorRecord, options: QaOptions) -> list[Reason]:
+def _wording(record: LocalisationRecord) -> FieldWording:
+    return IN_MAP if record.explored is None else WITHOUT_MAP
+
+
+def _counted(sensor: SensorRecord, options: QaOptions, words: FieldWording) -> list[Reason]:
     """Return which readings of a sensor do not count, and how the others fit."""
     use = sensor.use
     if not use.used:
@@ -279,16 +323,15 @@ def _counted(sensor: SensorRecord, options: QaOptions) -> list[Reason]:
     return [
         *options.rejected.reasons(
             wrong,
-            f"{wrong:.0%} of its readings inside the map do not fit it where the others place "
-            "the vehicle, and do not count: the place has changed since it was mapped, "
-            "something passed by, or the sensor is no longer as calibrated.",
+            f"{wrong:.0%} {words.compared} where the others place the vehicle, and do not count: "
+            f"{words.changed}, or the sensor is no longer as calibrated.",
         ),
         *outside_map(lost, options),
         *options.chi_square.reasons(
             use.chi2_per_dof,
-            f"Its residuals are {use.chi2_per_dof**0.5:.1f} times as large as noise and map lead "
-            "to expect: it is noisier or no longer as calibrated, or the map is less exact than "
-            "it states.",
+            f"Its residuals are {use.chi2_per_dof**0.5:.1f} times as large as noise and "
+            f"{words.expected} lead to expect: it is noisier or no longer as calibrated, or "
+            f"{words.inexact}.",
         ),
     ]
 

@@ -32,6 +32,8 @@ EVALUATIONS, AGAIN = 100, 50  # of the likelihood, and where it was searched bef
 FIRST = np.array([0.0, 0.0, -2.0, -2.0, 0.7])
 LOWEST = np.array([-3.0, -1.2, -6.0, -7.0, -3.0])
 HIGHEST = np.array([3.0, 3.0, 1.0, 7.0, 4.0])
+LENGTH = 1  # which of them that is
+SHORTEST_M = float(np.exp(LOWEST[LENGTH]))
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ def learnt_spectrum(
     offset_ut: float,
     eigenfunctions: int,
     first: FieldSpectrum | None = None,
+    shortest_m: float = SHORTEST_M,
 ) -> FieldSpectrum:
     """Return the hyperparameters of the largest marginal likelihood.
 
@@ -99,9 +102,12 @@ def learnt_spectrum(
         How many. What shorter ones would hold counts as noise.
     first
         Where to begin.
+    shortest_m
+        The field's length is no shorter, metres.
     """
     likelihood = SpectrumLikelihood(readings, distortion, offset_ut, eigenfunctions)
-    start = FIRST if first is None else first.at
+    lowest = np.where(np.arange(len(LOWEST)) == LENGTH, np.log(shortest_m), LOWEST)
+    start = np.maximum(FIRST if first is None else first.at, lowest)
 
     def cost(at: FloatArray) -> float:
         return -likelihood.log_likelihood(at)
@@ -110,7 +116,7 @@ def learnt_spectrum(
         cost,
         start,
         method="Nelder-Mead",
-        bounds=Bounds(LOWEST, HIGHEST),
+        bounds=Bounds(lowest, HIGHEST),
         options={
             "xatol": 0.05,
             "fatol": 0.3,

@@ -66,7 +66,7 @@ class FieldSolution:
         What the correction of odometry is worth, once that was asked; where nothing is shown to be
         gained the poses are odometry's.
     noise
-        Of the sensor, where it is estimated from the drive.
+        Of one sensor, or of several alike, where it is estimated from the drive.
     """
 
     solution: DriveSolution

@@ -20,6 +20,7 @@ from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 from l2m_gtsam.slam.unknown_field.spectrum import (
     LEARNT_FROM,
     MARGIN,
+    SHORTEST_M,
     FieldSpectrum,
     LearntReadings,
     learnt_spectrum,
@@ -28,6 +29,9 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile, TiledDrive
 from l2m_gtsam.slam.unknown_field.tiles import Anchoring, relative_place
 
 LEAST_WAVES = 50
+# In the logarithm of the likelihood. Searches end up to seven below the maximum.
+CLEAR = 10.0
+LONGER = np.geomspace(1.05, 20.0, 60)  # times a length, of which the first that is held is taken
 
 
 @dataclass(frozen=True)
@@ -144,7 +148,32 @@ def learnt_prior(
     -------
     The prior; None where the field has more detail than so many eigenfunctions hold.
     """
-    return prior_about(drive, poses, options, spectrum_at(drive, poses, options, COARSE, first))
+    spectrum = spectrum_at(drive, poses, options, COARSE, first)
+    prior = prior_about(drive, poses, options, spectrum)
+    if prior is not None:
+        return prior
+    # A search may end at a field of short waves that nothing speaks for.
+    least = shortest_held(drive, poses, options.waves, spectrum)
+    longer = spectrum_at(drive, poses, options, COARSE, first, least)
+    if longer.log_likelihood < spectrum.log_likelihood - CLEAR:
+        return None
+    return prior_about(drive, poses, options, longer)
+
+
+def shortest_held(
+    drive: Drive, poses: list[gtsam.Pose3], waves: int, spectrum: FieldSpectrum
+) -> float:
+    """Return the shortest length in metres of a coarse field that so many eigenfunctions hold.
+
+    Other parameters as of ``learnt_prior``; ``spectrum`` is of a field of shorter length.
+    """
+    length = spectrum.prior.length
+
+    def held(times: float) -> bool:
+        prior = spectrum.prior.model_copy(update={"length": times * length})
+        return full_prior(drive, poses, replace(spectrum, prior=prior), COARSE).waves <= waves
+
+    return float(length * next(times for times in LONGER if held(times)))
 
 
 def fine_prior(
@@ -164,10 +193,11 @@ def spectrum_at(
     options: WholeFieldOptions,
     detail: FieldDetail,
     first: FieldSpectrum | None = None,
+    shortest_m: float = SHORTEST_M,
 ) -> FieldSpectrum:
     """Learn what field and noise are like at an estimate of the poses.
 
-    Other parameters as of ``learnt_prior``.
+    The field's length is ``shortest_m`` at least; other parameters as of ``learnt_prior``.
     """
     where = relative_place(drive.readings, poses, 0, drive.sensors)
     x, R = where.x, where.readings.R_map_lidar
@@ -175,7 +205,8 @@ def spectrum_at(
     corrected = np.einsum("nji,nj->ni", R, where.field(drive.sensors))
     seconds = 1e-9 * (drive.reading_ns - drive.stamp_ns[0])
     readings = LearntReadings(x[few], R[few], corrected[few], seconds[few])
-    return learnt_spectrum(readings, options.distortion, options.offset, detail.learnt_with, first)
+    distortion, offset = options.distortion, options.offset
+    return learnt_spectrum(readings, distortion, offset, detail.learnt_with, first, shortest_m)
 
 
 def prior_about(

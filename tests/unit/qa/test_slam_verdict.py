@@ -8,6 +8,7 @@ import pytest
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.localisation import judge_localisation, localisation_thresholds
 from l2m_gtsam.records.localisation import (
+    Explored,
     LocalisationStatus,
     OdometryScale,
     OdometryTurn,
@@ -153,6 +154,17 @@ def test_a_bad_sensor_beside_a_good_one_is_a_warning_for_the_whole() -> None:
     assert text == "None of its 100 readings counts."
     noisy = judged(replace(good(), sensors=(first, used(second, chi2=2.25))))
     assert "1.5 times as large as noise and map" in texts(noisy, Level.WARN)[0]
+
+
+def test_a_drive_without_a_map_is_not_told_of_one() -> None:
+    explored = replace(good(), explored=Explored(3, 0.5))
+    first, second = explored.sensors
+    noisy = replace(explored, sensors=(used(first, rejected=60), used(second, chi2=4.0)))
+    fit, noise = texts(judged(noisy), Level.FAIL)[0], texts(judged(noisy), Level.WARN)[-1]
+    assert fit.startswith("60% of its readings do not fit the field of the others")
+    assert noise.startswith("Its residuals are 2.0 times as large as noise and the estimated field")
+    assert "its noise is stated too small" in noise
+    assert "map" not in fit + noise
 
 
 def test_a_place_that_changed_is_told_once_for_all_sensors() -> None:

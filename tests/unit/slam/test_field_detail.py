@@ -11,7 +11,18 @@ from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
 from l2m_gtsam.slam.drive import EXACT_START, Drive
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions, WholeFieldOptions
-from l2m_gtsam.slam.unknown_field.whole_field import fine_prior, learnt_prior, waves_for
+from l2m_gtsam.slam.unknown_field import whole_field
+from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
+from l2m_gtsam.slam.unknown_field.whole_field import (
+    CLEAR,
+    COARSE,
+    fine_prior,
+    full_prior,
+    learnt_prior,
+    shortest_held,
+    spectrum_at,
+    waves_for,
+)
 from l2m_gtsam.studies.slam.methods import as_recorded
 
 COUNT, EVERY_S = 300, 0.25
@@ -51,6 +62,48 @@ def test_a_field_with_detail_is_likelier_as_a_fine_one(drive: Drive) -> None:
 def test_a_fine_field_has_as_many_waves_as_are_allowed(drive: Drive) -> None:
     poses = drive.dead_reckoning()
     assert fine_prior(drive, poses, WholeFieldOptions(waves=60)).waves == 60
+
+
+def with_length(spectrum: FieldSpectrum, length: float) -> FieldSpectrum:
+    return replace(spectrum, prior=spectrum.prior.model_copy(update={"length": length}))
+
+
+@pytest.fixture(scope="module")
+def short(drive: Drive) -> FieldSpectrum:
+    """What is learnt of the drive, but for a length that needs hundreds of waves."""
+    learnt = spectrum_at(drive, drive.dead_reckoning(), WholeFieldOptions(), COARSE)
+    return with_length(learnt, 0.15)
+
+
+def test_the_shortest_length_that_is_held_is_the_shortest(
+    drive: Drive, short: FieldSpectrum
+) -> None:
+    poses, waves = drive.dead_reckoning(), 80
+    least = shortest_held(drive, poses, waves, short)
+
+    def needed(length: float) -> int:
+        return full_prior(drive, poses, with_length(short, length), COARSE).waves
+
+    assert least > short.prior.length
+    assert needed(least) <= waves < needed(0.94 * least)  # lengths are tried in steps of 5 %
+
+
+@pytest.mark.parametrize("less", [-3.0, 0.5 * CLEAR, 2 * CLEAR])
+def test_detail_that_nothing_speaks_for_is_no_detail(
+    drive: Drive, short: FieldSpectrum, monkeypatch: pytest.MonkeyPatch, less: float
+) -> None:
+    """A search that ended at short waves is done again among longer ones."""
+
+    def searched(*given: object) -> FieldSpectrum:
+        if not isinstance(shortest_m := given[-1], float):
+            return short
+        longer = with_length(short, shortest_m)
+        return replace(longer, log_likelihood=short.log_likelihood - less)
+
+    monkeypatch.setattr(whole_field, "spectrum_at", searched)
+    prior = learnt_prior(drive, drive.dead_reckoning(), WholeFieldOptions(waves=80))
+    assert (prior is None) == (less > CLEAR)
+    assert prior is None or prior.waves <= 80
 
 
 def test_waves_below_a_cut_are_counted() -> None:
