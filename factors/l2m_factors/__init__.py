@@ -38,6 +38,7 @@ from l2m_factors.step import (
     drift_weights,
     drifting_fixed_axes_step,
     drifting_step,
+    fixed_axes_residual,
     fixed_axes_step_factor,
     scaled_step_factor,
 )
@@ -104,6 +105,7 @@ __all__ = [
     "effective_parameters",
     "effective_parameters_factor",
     "field_rate",
+    "fixed_axes_residual",
     "fixed_axes_step_factor",
     "held_directions",
     "joint_residual",

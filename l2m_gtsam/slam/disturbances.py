@@ -14,6 +14,7 @@ from scipy.ndimage import uniform_filter1d
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.pose_graph import step_errors
 from l2m_gtsam.solve.chi_square import exceeded_by
 
 AXES = 3
@@ -160,12 +161,7 @@ def slips(drive: Drive, poses: list[gtsam.Pose3], scale_error: float = 0.0) -> I
     """Yield where poses and odometry differ, in order of time; arguments as above."""
     if not len(drive.steps):
         return
-    errors = np.array(
-        [
-            gtsam.Pose3.Logmap(drive.step(k, scale_error).between(poses[k].between(poses[k + 1])))
-            for k in range(len(drive.steps))
-        ]
-    )
+    errors = step_errors(drive, poses, scale_error)
     squared = np.einsum(
         "ni,ni->n", errors, np.linalg.solve(drive.steps.covariance, errors[:, :, None])[:, :, 0]
     )

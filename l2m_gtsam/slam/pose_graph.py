@@ -22,6 +22,7 @@ from l2m_factors import (
     X,
     drifting_fixed_axes_step,
     drifting_step,
+    fixed_axes_residual,
     fixed_axes_step_factor,
     held_directions,
     joint_residual,
@@ -57,14 +58,29 @@ def between_factor(number: int, step: gtsam.Pose3, covariance: FloatArray) -> gt
     return gtsam.BetweenFactorPose3(X(number), X(number + 1), step, noise)
 
 
-def step_factor(drive: Drive, number: int, scale_error: float = 0.0) -> gtsam.NonlinearFactor:
-    """Return odometry's factor from a key pose to the next, its length corrected for an error."""
+def step_factor(drive: Drive, number: int) -> gtsam.NonlinearFactor:
+    """Return odometry's factor from a key pose to the next."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
     if drive.steps.fixed_axes is not None:
         turn, way = fixed_axes_step(drive, number, drive.steps.fixed_axes)
-        return fixed_axes_step_factor(number, turn, (1 + scale_error) * way, noise)
-    step = drive.step(number, scale_error)
-    return between_factor(number, step, drive.steps.covariance[number])
+        return fixed_axes_step_factor(number, turn, way, noise)
+    return between_factor(number, drive.step(number), drive.steps.covariance[number])
+
+
+def step_errors(drive: Drive, poses: list[gtsam.Pose3], scale_error: float = 0.0) -> FloatArray:
+    """Return by how much K poses differ from odometry's steps, as its factors count it, (K - 1, 6).
+
+    Rotation in rad before translation in metres, in the frame of the next pose.
+    """
+    errors = np.empty((len(drive.steps), 6))
+    for k in range(len(errors)):
+        if drive.steps.fixed_axes is None:
+            moved = poses[k].between(poses[k + 1])
+            errors[k] = gtsam.Pose3.Logmap(drive.step(k, scale_error).between(moved))
+        else:
+            turn, way = fixed_axes_step(drive, k, drive.steps.fixed_axes)
+            errors[k] = fixed_axes_residual(poses[k : k + 2], turn, (1 + scale_error) * way, None)
+    return errors
 
 
 def scaled_factor(drive: Drive, number: int) -> gtsam.NonlinearFactor:
@@ -258,10 +274,12 @@ def write_g2o(path: Path, solution: DriveSolution) -> None:
     """Write localised key poses as vertices and odometry as edges.
 
     The format knows no magnetic readings, no prior, no scale and no drift: lengths are corrected as
-    they came out. Numbers have six digits, as GTSAM writes them.
+    they came out. Nor does it know steps along fixed axes: those along the vehicle's stand for
+    them. Numbers have six digits, as GTSAM writes them.
     """
     graph = gtsam.NonlinearFactorGraph()
     drive = solution.drive.without_drift(solution.steady, solution.poses)
     for number in range(len(drive.steps)):
-        graph.add(step_factor(drive, number, solution.scale_error))
+        step = drive.step(number, solution.scale_error)
+        graph.add(between_factor(number, step, drive.steps.covariance[number]))
     gtsam.writeG2o(graph, pose_values(solution.poses), str(path))

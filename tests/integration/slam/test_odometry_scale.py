@@ -130,3 +130,13 @@ def test_edges_are_as_long_as_ways_came_out(tmp_path: Path) -> None:
     # Six digits of some 0.1 m.
     expected = (1 + solution.scale_error) * solution.drive.steps.p
     np.testing.assert_allclose(edges, expected, atol=1e-6)
+
+
+def test_steps_along_fixed_axes_are_edges_as_well(tmp_path: Path) -> None:
+    """GTSAM writes no factors of its own making in Python: it would leave them out in silence."""
+    solution = localised(1)
+    drive = solution.drive
+    along = replace(drive.steps, fixed_axes=np.zeros_like(drive.steps.p))
+    write_g2o(tmp_path / "graph.g2o", replace(solution, drive=replace(drive, steps=along)))
+    lines = (tmp_path / "graph.g2o").read_text().splitlines()
+    assert sum(line.startswith("EDGE") for line in lines) == len(drive.steps)
