@@ -164,7 +164,7 @@ def noise_notes(found: SensorNoise | None, sensors: KnownSensors) -> NoiseNotes:
     if found is None:
         return NoiseNotes()
     stated = float(np.sqrt(np.mean(sensors.noise**2)))
-    if len(sensors.names) == 1:
+    if found.slow_s > 0:  # of one sensor in one field
         own = (
             f"readings of {sensors.names[0]} are off by {found.white_ut:.2g} uT each and by "
             f"{found.slow_ut:.2g} uT that last {found.slow_s:.2g} s, by the drive itself; its "
@@ -202,14 +202,14 @@ def solve_field(drive: Drive, options: SlamOptions, progress: Progress) -> Field
             return mapped
     prior = drive_prior(drive, poses, options.tiles)
     progress("learning the field's prior", 1.0)
-    return map_drive(drive, poses, prior, options, progress)
+    return replace(map_drive(drive, poses, prior, options, progress), prior=prior)
 
 
 def where_gained(drive: Drive, mapped: FieldSolution, options: SlamOptions) -> FieldSolution:
     """Return a solved drive; where nothing is shown to be gained, at the poses of odometry."""
-    if mapped.gain is not None:
+    prior = mapped.prior
+    if prior is None:
         return mapped
-    prior = drive_prior(drive, without_field(drive, options).poses, options.tiles)
     recorded = with_recorded_jumps(drive)
     odometry = without_field(recorded, options).poses
     found = with_gain(mapped, recorded, odometry, larger(prior), options)

@@ -43,7 +43,7 @@ CONVEX = 1.0  # of the loss, with weights at the poses of the filter
 # Factors of the noise. With the noise alone the likelihood has maxima between the poses of odometry
 # and the best ones, and a filter that linearises once is led to one of them: on the model ship it
 # finds back with 3 to 8 times the noise, and ends up to 5 m off with the noise alone.
-FOLLOWED = (2.0, 4.0)  # of the filter's passes, the first at odometry's poses
+FOLLOWED = (4.0, 8.0)  # of the filter's passes, the first at odometry's poses
 CLOSE = 0.5  # decrease of the error that moves poses by less than their sigmas
 # Sigmas of the ship's poses are 5 to 16 % larger than with 120, heights 26 %, in less than half the
 # time.
@@ -130,7 +130,9 @@ class Stage:
 
 # The field is fine in the end, where poses are within its short waves, and that stage has to
 # converge: after four iterations poses of a sensor in the hand are up to four times as far off.
-OFF_LINE = (Stage(4.0, 2, 4), Stage(2.0, 2, 4), Stage(1.0, 2, 30, fine_prior))
+# Twice the noise in it: with the noise alone 26 to 36 m of the ship end in maxima with NEES of 10
+# to 16 instead of 6, and whole runs with 8 instead of 6.
+OFF_LINE = (Stage(8.0, 2, 4), Stage(4.0, 2, 4), Stage(2.0, 2, 30, fine_prior))
 # On line a fine field gains nothing, as the filter goes on with coarse poses. Nor do readings with
 # their noise alone: the last poses of a drive so far, which nothing after them holds, follow it.
 ON_LINE = (Stage(4.0, 1, 4), Stage(1.5, 1, 4))

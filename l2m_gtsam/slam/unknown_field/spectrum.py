@@ -25,8 +25,10 @@ from l2m_gtsam.slam.unknown_field.sensor_noise import AXES, SensorNoise, whiten
 
 LEARNT_FROM = 300  # readings
 MARGIN = 1.5  # of the box about the path, in lengths of the field: on its faces the field is normal
-NEWTON, HALVINGS = 8, 20
-EVALUATIONS, AGAIN = 100, 50  # of the likelihood, and where it was searched before
+NEWTON, HALVINGS = 60, 20
+SAME = 1e-7  # decrease of a cost that is none
+EVALUATIONS = 200  # of the likelihood; a search takes 60 to 110
+STEP, GAIN = 1e-3, 1e-4  # of the differences that are its slopes; share of it that is worth a step
 # Logarithms of: strength in that of the readings, length in m, noise in the same strength, odds of
 # white against slow noise, time of the latter in s.
 FIRST = np.array([0.0, 0.0, -2.0, -2.0, 0.7])
@@ -115,14 +117,9 @@ def learnt_spectrum(
     end = minimize(
         cost,
         start,
-        method="Nelder-Mead",
+        method="L-BFGS-B",
         bounds=Bounds(lowest, HIGHEST),
-        options={
-            "xatol": 0.05,
-            "fatol": 0.3,
-            "maxfev": EVALUATIONS if first is None else AGAIN,
-            "initial_simplex": start + np.vstack([np.zeros(len(start)), 0.5 * np.eye(len(start))]),
-        },
+        options={"eps": STEP, "ftol": GAIN, "maxfun": EVALUATIONS},
     )
     return FieldSpectrum(
         likelihood.prior(end.x),
@@ -202,17 +199,28 @@ class SpectrumLikelihood:
         return -self._cost(information, a) - 0.5 * volume
 
     def _likeliest(self, information: FloatArray) -> FloatArray:
-        """Return the mode of A, h by Newton's method."""
-        a = self._mean.copy()
+        """Return the mode of A, h that descent from the given calibration leads to.
+
+        ``-log |det A|`` is concave along rotations of A, and the cost has valleys for sensors that
+        are mounted otherwise. Newton's step would go up there, or far away: curvatures count by
+        their size, and no entry moves by more than its standard deviation at once.
+        """
+        a, sigma = self._mean.copy(), np.sqrt(self._variance)
         cost = self._cost(information, a)
         for _ in range(NEWTON):
             gradient, hessian = self._slopes(information, a)
-            step = np.linalg.solve(hessian, gradient)
+            curvature, axes = np.linalg.eigh(hessian)
+            step = axes @ (axes.T @ gradient / np.abs(curvature))
+            step /= max(1.0, float(np.abs(step / sigma).max()))
+            lower = cost
             for halving in range(HALVINGS):
                 trial = a - 0.5**halving * step
-                if (lower := self._cost(information, trial)) <= cost:
-                    a, cost = trial, lower
+                if (at_trial := self._cost(information, trial)) <= cost:
+                    a, lower = trial, at_trial
                     break
+            if cost - lower < SAME:
+                break
+            cost = lower
         return a
 
     def _cost(self, information: FloatArray, a: FloatArray) -> float:

@@ -37,6 +37,7 @@ from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import levenberg_marquardt, weights_first
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
+from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
 from l2m_gtsam.solve.robust import WEIGHTS
 
 AWAY_M = 5.0  # path length after which entering a tile again closes a loop
@@ -67,6 +68,8 @@ class FieldSolution:
         gained the poses are odometry's.
     noise
         Of one sensor, or of several alike, where it is estimated from the drive.
+    prior
+        Of the tiles, as it was learnt; absent for one field.
     """
 
     solution: DriveSolution
@@ -76,6 +79,7 @@ class FieldSolution:
     marginals: PoseCovariance
     gain: Gain | None = None
     noise: SensorNoise | None = None
+    prior: FieldPrior | None = None
 
     @property
     def is_corrected(self) -> bool:
