@@ -310,16 +310,17 @@ def _why_silent(usable: int, counts: SyncCounts, moved: Movement, needed: int) -
     if counts.kept >= needed:
         return "the sensor reports one constant value: it is stuck"
     reason = f"{moved.rest}: " if moved.at_rest else ""
-    without = counts.without_regressor
+    without, elsewhere = counts.without_regressor, counts.elsewhere
     numbers = f", {without} without a recorded number" if without else ""
     beyond = f", {counts.saturated} beyond its range" if counts.saturated else ""
+    apart = f", {elsewhere} in parts of the map that do not count" if elsewhere else ""
     remedy = _remedy(counts, moved, needed)
     return (
         f"{reason}{usable} usable readings of {counts.received} received "
         f"({counts.not_finite} not finite, {counts.repeated} repeated, "
         f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap or a "
         f"far turn between poses, "
-        f"{counts.thinned} at a place already read{numbers}{beyond}), at least {needed} "
+        f"{counts.thinned} at a place already read{numbers}{beyond}{apart}), at least {needed} "
         f"are needed: {remedy}"
     )
 
@@ -337,6 +338,7 @@ def _remedy(counts: SyncCounts, moved: Movement, needed: int) -> str:
         "drive on, through more places": counts.thinned,
         "record the number over the whole drive": counts.without_regressor,
         "choose a larger range, or keep the vehicle's iron away": counts.saturated,
+        "raise `calibration.solve.most_weights`": counts.elsewhere,
     }
     return max(lost, key=lambda each: lost[each])
 

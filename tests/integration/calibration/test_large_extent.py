@@ -8,6 +8,7 @@ import pytest
 
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.data import Recording, SourceFile
+from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.planning.plan import plan
 from l2m_gtsam.recording.splitting import split_at
@@ -63,6 +64,17 @@ def test_a_part_of_the_drive_counts(made: MovingDrive, tmp_path: Path) -> None:
     write_calibration(tmp_path / "a.yaml", part)
     back = read_calibration(tmp_path / "a.yaml")
     assert [each.sync for each in back.sensors] == [each.sync for each in part.sensors]
+
+
+def test_too_small_a_part_is_named(made: MovingDrive) -> None:
+    """Most readings are in tiles that do not count: nothing is wrong with the sensor."""
+    chosen = options(made)
+    few = {"most_weights": LIMIT, "min_readings": 490}
+    chosen = chosen.model_copy(update={"solve": chosen.solve.model_copy(update=few)})
+    with pytest.raises(CalibrationError) as said:
+        calibrate(made.silent, surveyed(1), chosen)
+    assert " 177 in parts of the map that do not count), at least 490 are needed" in str(said.value)
+    assert str(said.value).endswith(": raise `calibration.solve.most_weights`")
 
 
 def test_a_calibration_is_tested_on_a_part(
