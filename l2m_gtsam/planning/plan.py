@@ -196,8 +196,12 @@ def assumed_recording(
 
 
 def with_motion(readings: Readings, motion: ExtraMotion) -> Readings:
-    """Return the readings of a drive to which a motion is added: one per sensor and pose."""
-    S, K, roots = len(readings.sensors), len(motion.p), readings.pose_root
+    """Return the readings of a drive to which a motion is added: one per sensor and pose.
+
+    Nobody knows the recorded numbers of a motion: they are the means of the drive.
+    """
+    S, K = len(readings.sensors), len(motion.p)
+    roots, numbers = readings.pose_root, readings.regressors
     later = BREAK_NS + np.round(NANOSECONDS * motion.seconds).astype(np.int64)
     added = Readings(
         readings.sensors,
@@ -208,6 +212,7 @@ def with_motion(readings: Readings, motion: ExtraMotion) -> Readings:
         np.zeros((S * K, 3)),
         LidarMotion.steady(np.tile(motion.twist, (S, 1))),
         None if roots is None else np.tile(roots[:1], (S * K, 1, 1)),
+        None if numbers is None else np.tile(numbers.mean(axis=0), (S * K, 1)),
     )
     both = joined_rows([readings, added])
     return both[np.argsort(both.sensor, kind="stable")]
