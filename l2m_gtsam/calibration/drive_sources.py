@@ -35,7 +35,7 @@ from l2m_gtsam.maps.sources.source import SourceShape
 from l2m_gtsam.records.places import CLEAR, Cause, CauseGain, ChangedSource
 from l2m_gtsam.solve.linear_algebra import right_divided
 
-DETECTED_UT = 0.2  # weaker a source is not detected
+DETECTED_UT = 0.2  # weaker a source is not detected, if it is stronger anywhere
 DETECTED_SHARE = 0.2  # of its strongest field: where a passage begins and ends
 APART = 30  # slots from one passage to the next
 REJECTED = 0.5  # share of the readings of an average, from which it disagrees
@@ -158,7 +158,9 @@ def changed_sources(
     for k, shape in enumerate(found.shapes):
         field, _ = shape.field_and_gradient(rows.points)
         strength = np.linalg.norm(field, axis=1)
-        detected = strength > max(DETECTED_UT, DETECTED_SHARE * float(strength.max(initial=0.0)))
+        strongest = float(strength.max())
+        least = DETECTED_UT if strongest > DETECTED_UT else 0.0
+        detected = strength > max(least, DETECTED_SHARE * strongest)
         away = np.linalg.norm(rows.points - shape.position, axis=1)
         passage = passages_of(drive.averages.slot, detected)
         others = rows.residual - found.field(rows.points) + field
@@ -171,7 +173,7 @@ def changed_sources(
                 half_axis=shape.half_axis,
                 gain=float(found.gains[k]),
                 nearest=float(away.min()),
-                strongest=float(strength.max()),
+                strongest=strongest,
                 passages=int(passage.max(initial=-1)) + 1,
                 explanations=explanations(rows, drive, field, others, passage),
             )
