@@ -5,7 +5,6 @@ was rejected is where a change is plainest. Then the map is given the sources an
 solved again, with the sources as variables beside the sensors: readings that they explain count.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +32,6 @@ AXES = 3
 # Errors of a map over what it states, at held-out readings of its survey: with more of them its
 # model is not the place's. Up to this they count as large as they are.
 MOST_OVER_STATED = 3.0
-SINGULAR = 1e6  # condition of a C that is not to be inverted
 ROUNDS = 4  # of solving with sources and looking for them again
 SETTLED_SIGMAS = 0.3
 
@@ -67,13 +65,10 @@ class ChangedSources:
 
 
 def averaged_drive(
-    solution: OneKeySolution,
-    sensors: Sequence[int],
-    field_map: QueryableMap,
-    options: ChangesOptions,
+    solution: OneKeySolution, field_map: QueryableMap, options: ChangesOptions
 ) -> AveragedDrive:
-    """Return averages of readings of solved sensors inside the map, rejected ones among them."""
-    inside = solution.inside & np.isin(solution.readings.sensor, sensors)
+    """Return averages of comparable readings inside the map, rejected ones among them."""
+    inside = solution.inside & np.isin(solution.readings.sensor, solution.comparable)
     readings = solution.readings.select(inside)
     estimate = solution.estimate
     used, nearest = solution.used[inside], options.sources.nearest
@@ -143,12 +138,9 @@ def search(
         return None
     if solution.contradicted:  # no place is as the map has it
         return None
-    # A sensor with a dead axis does not say what the field is.
-    whole = np.linalg.cond(solution.estimate.C()) < SINGULAR
-    sensors = tuple(each for each in solution.placed if whole[each])
-    if not sensors or not is_place_of(field_map):
+    if not solution.comparable or not is_place_of(field_map):
         return None
-    drive = averaged_drive(solution, sensors, field_map, options)
+    drive = averaged_drive(solution, field_map, options)
     places = suspected(drive, field_map, options.averaging)
     if not len(places) and known is None:
         return None

@@ -88,11 +88,11 @@ def shown_jumps(
     They are looked for where something else than noise was found: a process, or places that differ
     from the map. A sensor that jumps often wanders, which is a process, as a drift is.
     """
-    if not isinstance(field_map, UncertainMap) or solution.contradicted or not solution.placed:
+    if not isinstance(field_map, UncertainMap) or not is_place_of(field_map):
         return ()
-    if not is_place_of(field_map):
+    if solution.contradicted or not solution.comparable:
         return ()
-    drive = averaged_drive(solution, solution.placed, field_map, options)
+    drive = averaged_drive(solution, field_map, options)
     if not solution.budget.found and not len(suspected(drive, field_map, options.averaging)):
         return ()
     rows = drive.marginal(field_map, field_map, solution.budget, options.averaging)

@@ -74,6 +74,7 @@ MAX_ROUNDS = 10
 SETTLED_M = 1e-5
 # A vehicle moves a tenth of a millimetre meanwhile.
 SETTLED_S = 1e-4
+SINGULAR = 1e6  # condition of a C that is not to be inverted
 
 
 @dataclass(frozen=True)
@@ -140,9 +141,14 @@ class OneKeySolution:
         return self.inside & ~self.rejected
 
     @property
-    def placed(self) -> tuple[int, ...]:
-        """Solved sensors whose place is an optimum in the map."""
-        return tuple(each.sensor for each in self.solved if each.sensor not in self.stayed)
+    def comparable(self) -> tuple[int, ...]:
+        """Solved sensors whose readings say what the field is at a place in the map.
+
+        Not those that stayed where they started, nor those with a dead axis.
+        """
+        whole = np.linalg.cond(self.estimate.C()) < SINGULAR
+        solved = [each.sensor for each in self.solved]
+        return tuple(each for each in solved if whole[each] and each not in self.stayed)
 
 
 def solve_one_key(

@@ -53,10 +53,9 @@ def with_causes(
     """
     if not stretches or not isinstance(field_map, UncertainMap) or not is_place_of(field_map):
         return stretches
-    if solution.contradicted:
+    if solution.contradicted or not solution.comparable:
         return stretches
-    solved = [each.sensor for each in solution.solved]
-    drive = averaged_drive(solution, solved, field_map, options)
+    drive = averaged_drive(solution, field_map, options)
     rows = drive.marginal(field_map, field_map, solution.budget, options.averaging)
     places = DisagreeingPlaces.of(rows, drive)
     return tuple(replace(each, explanations=places.explanations(each)) for each in stretches)
