@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, f
+from scipy.special import fdtri
 
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import IntArray, SourceFile, same_content
@@ -25,6 +25,7 @@ from l2m_gtsam.records.validation import (
     ValidatedSensor,
 )
 from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.solve.chi_square import chance_beyond, quantile
 from l2m_gtsam.solve.closed_form import refitted
 from l2m_gtsam.validation.innovation import detectable_change, knows_its_errors
 from l2m_gtsam.validation.recheck import Recheck, SensorDrive
@@ -103,12 +104,12 @@ def _of_readings(value: float, freedom: int, sensor: SensorCalibration) -> ChiSq
     if sensor.residuals is None:
         return _chi_square(value, freedom)
     freedom, others = max(freedom, 1), max(3 * sensor.residuals.readings - PARAMETERS, 1)
-    low, high = freedom * f.ppf(BAND, freedom, others)
+    low, high = freedom * fdtri(freedom, others, BAND)
     return ChiSquare(value, freedom, float(low), float(high))
 
 
 def _chi_square(value: float, freedom: int) -> ChiSquare:
-    low, high = chi2.ppf(BAND, max(freedom, 1))
+    low, high = quantile(BAND, max(freedom, 1))
     return ChiSquare(value, freedom, float(low), float(high))
 
 
@@ -123,7 +124,7 @@ def _changes(found: Recheck) -> tuple[CalibrationChange, ...]:
         first = len(columns_of(found.parts[: found.parts.index(part)]))
         at = slice(first, first + width(part))
         sigma = np.sqrt(np.diag(found.covariance)[at])
-        chance = float(chi2.sf(gain, width(part)))
+        chance = float(chance_beyond(gain, width(part)))
         changes.append(change_of(part, found.change[at], sigma, chance))
     return tuple(changes)
 

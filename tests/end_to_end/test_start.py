@@ -101,8 +101,7 @@ def test_the_first_bar_comes_before_all_that_is_heavy(
 def test_calibrations_and_slam_load_no_statistics_and_no_other_peers() -> None:
     """They take half a second for a quantile, or are for studies only."""
     loaded = "[each for each in ('scipy.stats', 'sklearn', 'dask') if each in sys.modules]"
-    modules = ", ".join(
-        f"l2m_gtsam.batch.{each}" for each in ("drives", "fleet", "online_slam", "reports", "slam")
-    )
+    named = ("drives", "fleet", "online_slam", "reports", "slam", "validation")
+    modules = ", ".join(f"l2m_gtsam.batch.{each}" for each in named)
     needed = f"import json, sys, {modules}"
     assert said(f"{needed}; print(json.dumps({loaded}))") == [[]]
