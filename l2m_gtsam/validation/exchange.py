@@ -43,8 +43,6 @@ def exchanged(sensors: Sequence[TestedSensor]) -> dict[str, str]:
     ----------
     sensors
         All that were tested.
-    field_map
-        The map.
     """
     wrong = [each for each in sensors if each.misfits]
     if len(wrong) < 2:
