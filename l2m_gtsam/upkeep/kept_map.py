@@ -19,7 +19,7 @@ from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.view import places_of
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.map_building import SurveyReadings, listed_sensor, suite_readings
+from l2m_gtsam.mapping.map_building import listed_sensor, suite_readings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.steady_survey import steady_survey
 from l2m_gtsam.maps.field_map import FieldMap, check_frame
@@ -214,7 +214,9 @@ class MappingVehicle:
         """Return a map after a drive that shows some sources; otherwise as ``after_drive``."""
         read = suite_readings([recording], self.suite, self.options.sync)
         found = dated_changes(field_map, seen.sources, diary_of(field_map, survey))
-        return renewed(field_map, drive_readings(read, drive), found, survey).doubted(read.doubts)
+        stated = read.suite if read.suite.stated else None
+        later = DriveReadings(additional_set(read.points, read.field), stated, drive)
+        return renewed(field_map, later, found, survey).doubted(read.doubts)
 
 
 def after_drive(
@@ -241,12 +243,6 @@ def diary_of(field_map: HarmonicMap, survey: MapDrive) -> MapDiary:
     """Return what a map was given so far; of one that does not know, its survey alone."""
     history = field_map.learnt.history
     return MapDiary((survey,)) if history is None else history.diary
-
-
-def drive_readings(read: SurveyReadings, drive: MapDrive) -> DriveReadings:
-    """Return readings of a suite as a map takes them."""
-    suite = read.suite if read.suite.stated else None
-    return DriveReadings(additional_set(read.points, read.field), suite, drive)
 
 
 def date_of(recording: Recording) -> MapDrive:

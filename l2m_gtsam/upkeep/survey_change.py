@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, IntArray, Recording
+from l2m_gtsam.data import FloatArray, Recording
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.mapping.map_building import survey_readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
@@ -62,8 +62,6 @@ def mapped_half(
     """Return a half that is mapped; None where it cannot be, or no steel changed."""
     try:
         field_map = drives.instead((half,)).mapped(1, cloud)
-        if not isinstance(field_map, HarmonicMap):
-            return None
         seen = drives.vehicle.shows(other, field_map)
     except L2MError:  # too little by itself to tell
         return None
@@ -80,13 +78,8 @@ def moment_of(drives: SurveyDrives, found: MappedHalf, *, before: bool) -> int:
     field = np.sum([each.field_and_gradient(read.points)[0] for each in shapes], axis=0)
     variance = known.variance + found.field_map.learnt.hyperparameters.noise**2
     likelier = 0.5 * np.sum((lacking**2 - (lacking - field) ** 2) / variance, axis=1)
-    stamps, gains = in_order(read.stamp_ns[known.inside], likelier[known.inside])
-    sums = np.append(0.0, np.cumsum(gains))
+    stamps, gains = read.stamp_ns[known.inside], likelier[known.inside]
+    order = np.argsort(stamps, kind="stable")
+    sums = np.append(0.0, np.cumsum(gains[order]))
     number = int(np.argmax(sums) if before else np.argmin(sums))
-    return int(stamps[min(number, len(stamps) - 1)])
-
-
-def in_order(stamp_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return stamps ascending, and values with them."""
-    order = np.argsort(stamp_ns, kind="stable")
-    return stamp_ns[order], values[order]
+    return int(stamps[order[min(number, len(stamps) - 1)]])

@@ -18,7 +18,6 @@ from l2m_gtsam.errors import L2MError
 from l2m_gtsam.mapping.map_building import map_of, survey_readings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.steady_survey import SteadySurvey
-from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.upkeep.agreement import disagreement
@@ -60,13 +59,13 @@ class SurveyDrives:
         """Return the same with other drives, in order of time."""
         return replace(self, steady=replace(self.steady, recordings=recordings))
 
-    def first(self, count: int) -> SteadySurvey:
-        """Return the drives before others."""
-        return replace(self.steady, recordings=self.steady.recordings[:count])
-
-    def mapped(self, count: int, cloud: FloatArray | None) -> FieldMap:
-        """Return a map of so many drives."""
-        return map_of(self.first(count), self.vehicle.suite, self.vehicle.options, cloud)
+    def mapped(self, count: int, cloud: FloatArray | None) -> HarmonicMap:
+        """Return a map of the first drives, so many of them."""
+        first = replace(self.steady, recordings=self.steady.recordings[:count])
+        field_map = map_of(first, self.vehicle.suite, self.vehicle.options, cloud)
+        if not isinstance(field_map, HarmonicMap):
+            raise TypeError(f"maps of kind {field_map.kind} are not kept up")
+        return field_map
 
     def disagreement(self, field_map: HarmonicMap) -> float:
         """Return by how much the drives differ, or both halves of one; 1 is beyond chance."""
@@ -88,8 +87,6 @@ class SurveyDrives:
         except L2MError:  # too little by itself to tell
             return None
         for number, recording in enumerate(recordings[1:], start=1):
-            if not isinstance(field_map, HarmonicMap):
-                break
             seen = self.vehicle.shows(recording, field_map)
             if max(seen.gain, seen.vehicle) > LEAST_GAIN and (seen.sources or seen.of_vehicle):
                 return Unlike(number, seen, field_map)
@@ -99,7 +96,7 @@ class SurveyDrives:
             field_map = field_map.updated(read.points, read.field, read.suite, read.poses)
         return None
 
-    def kept_up(self, first: "Unlike", cloud: FloatArray | None) -> FieldMap:
+    def kept_up(self, first: "Unlike", cloud: FloatArray | None) -> HarmonicMap:
         """Return a map of the drives before one that differs, after that one and all later."""
         recordings, number = self.steady.recordings, first.number
         seen: SeenSources | None = first.seen
@@ -107,8 +104,6 @@ class SurveyDrives:
         # A map of one drive is that already; one that was updated has the prior of the first.
         field_map = first.field_map if number == 1 else self.mapped(number, cloud)
         for each in recordings[number:]:
-            if not isinstance(field_map, HarmonicMap):
-                break
             seen = seen or self.vehicle.shows(each, field_map)
             if seen.of_vehicle:
                 return self.doubted(each, cloud)
@@ -116,11 +111,9 @@ class SurveyDrives:
             field_map, seen = self.vehicle.kept(field_map, *given), None
         return field_map
 
-    def doubted(self, recording: Recording, cloud: FloatArray | None) -> FieldMap:
+    def doubted(self, recording: Recording, cloud: FloatArray | None) -> HarmonicMap:
         """Return a map of all drives, one of which sensors read otherwise."""
         field_map = self.mapped(len(self.steady.recordings), cloud)
-        if not isinstance(field_map, HarmonicMap):
-            return field_map
         name = Path(recording.source.path).name
         return field_map.doubted(
             (
@@ -155,4 +148,4 @@ class Unlike:
 
     number: int
     seen: SeenSources
-    field_map: FieldMap
+    field_map: HarmonicMap

@@ -48,8 +48,6 @@ def map_surveys(
         return map_of(steady, suite, options, cloud)
     drives = SurveyDrives.of(steady, suite, options, changes)
     field_map = drives.mapped(len(recordings), cloud)
-    if not isinstance(field_map, HarmonicMap):
-        return field_map
     apart = drives.disagreement(field_map)
     if apart < 1:
         return field_map
@@ -67,16 +65,14 @@ def map_surveys(
     return field_map.doubted((differing(len(recordings)),))
 
 
-def with_changes(drives: SurveyDrives, cloud: FloatArray | None) -> FieldMap | None:
+def with_changes(drives: SurveyDrives, cloud: FloatArray | None) -> HarmonicMap | None:
     """Return a map with what changed between drives, or during a single one; None if nothing."""
     several = drives if len(drives.steady.recordings) > 1 else parted(drives, cloud)
     first = None if several is None else several.unlike(cloud)
     if several is None or first is None:
         return None
     kept = several.kept_up(first, cloud)
-    if isinstance(kept, HarmonicMap) and not is_kept_well(kept):
-        return kept.doubted((STILL_DIFFERING,))
-    return kept
+    return kept if is_kept_well(kept) else kept.doubted((STILL_DIFFERING,))
 
 
 STILL_DIFFERING = (
