@@ -104,9 +104,9 @@ def case(field_map: CompiledMap, count: int, each: int) -> Case:
     optimum = IndependentOptimum(view, field_map, field_map, estimate, tests, OPTIONS)
     drive_ = UncertainDrive.of(optimum)
     problem = UncertainProblem(drive_, estimate)
-    coverage = drive_.prior.coverage
+    coverage = drive_.coverage
     rows = gtsam.NonlinearFactorGraph()
-    information = drive_.prior.graph.at(0)
+    information = coverage.prior.at(0)
     for index in range(problem.graph.size()):
         factor = problem.graph.at(index)
         if set(factor.keys()) != set(information.keys()):

@@ -298,14 +298,30 @@ class Coverage:
         """Where the weights of each key stand among all of them."""
         return slices_of(self.sizes)
 
+    @cached_property
     def prior(self) -> gtsam.NonlinearFactorGraph:
-        """Return the prior of all weights, which is linear in them."""
+        """The prior of all weights, which is linear in them and the same in all rounds."""
         graph = gtsam.NonlinearFactorGraph()
         graph.add(map_weights_information(self.tiles, self.tile_information))
-        graph.push_back(self.prior_beside_tiles())
+        graph.push_back(self._prior_beside_tiles())
         return graph
 
-    def prior_beside_tiles(self) -> gtsam.NonlinearFactorGraph:
+    @cached_property
+    def information(self) -> FloatArray:
+        """The same as a matrix, shape (K, K)."""
+        tiles = self.tile_information
+        information = np.zeros((sum(self.sizes.values()),) * 2)
+        information[: len(tiles), : len(tiles)] = tiles
+        if beside := list(self.sizes.items())[len(self.tiles) :]:
+            zero, ordering = gtsam.Values(), gtsam.Ordering()
+            for key, size in beside:
+                zero.insert(key, np.zeros(size))
+                ordering.push_back(key)
+            linear = self._prior_beside_tiles().linearize(zero)
+            information[len(tiles) :, len(tiles) :], _ = linear.hessian(ordering)
+        return information
+
+    def _prior_beside_tiles(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior of all weights but those of tiles."""
         graph = gtsam.NonlinearFactorGraph()
         if self.knots is not None:

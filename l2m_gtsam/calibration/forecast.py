@@ -103,7 +103,7 @@ def stated_at(
         tests = problem.determinacies
         near = IndependentOptimum(view, field_map, field_map, estimate, tests, options)
         drive = UncertainDrive.of(near)
-        values = starting_values(estimate, view.sensors, drive.prior.coverage)
+        values = starting_values(estimate, view.sensors, drive.coverage)
         optimum = UncertainOptimum.at(UncertainProblem(drive, estimate), values)
         solved = optimum.solutions()
         if options.warp_m > 0:

@@ -260,7 +260,7 @@ def step_to_optimum(near: IndependentOptimum, budget: Budget = NOTHING_FOUND) ->
     places = ReadingPlaces.of(near.view.readings, near.field_map, estimate)
     drive = UncertainDrive.of(near, budget.at(places))
     problem = UncertainProblem(drive, estimate)
-    step = step_by_any(problem, starting_values(estimate, sensors, drive.prior.coverage))
+    step = step_by_any(problem, starting_values(estimate, sensors, drive.coverage))
     if problem.noise.pose is not None:
         likely = problem.at_likely_poses(step.values)
         problem = UncertainProblem(drive, estimate, readings=likely)

@@ -59,45 +59,6 @@ def starting_values(estimate: Estimate, sensors: list[int], coverage: Coverage) 
 
 
 @dataclass(frozen=True)
-class WeightsPrior:
-    """What is known of shared errors before any reading: the same in all rounds.
-
-    Attributes
-    ----------
-    coverage
-        The errors.
-    graph
-        Their prior as factors.
-    information
-        The same as a matrix, shape (K, K).
-    """
-
-    coverage: Coverage
-    graph: gtsam.NonlinearFactorGraph
-    information: FloatArray
-
-    @property
-    def sizes(self) -> dict[int, int]:
-        """Number of weights of each key."""
-        return self.coverage.sizes
-
-    @classmethod
-    def of(cls, coverage: Coverage) -> "WeightsPrior":
-        """Return the prior of the weights of a coverage."""
-        tiles = coverage.tile_information
-        information = np.zeros((sum(coverage.sizes.values()),) * 2)
-        information[: len(tiles), : len(tiles)] = tiles
-        if beside := list(coverage.sizes.items())[len(coverage.tiles) :]:
-            zero, ordering = gtsam.Values(), gtsam.Ordering()
-            for key, size in beside:
-                zero.insert(key, np.zeros(size))
-                ordering.push_back(key)
-            linear = coverage.prior_beside_tiles().linearize(zero)
-            information[len(tiles) :, len(tiles) :], _ = linear.hessian(ordering)
-        return cls(coverage, coverage.prior(), information)
-
-
-@dataclass(frozen=True)
 class IndependentOptimum:
     """What the last graph goes on from: the optimum with independent errors.
 
@@ -131,20 +92,20 @@ class UncertainDrive:
     ----------
     view, field_map, tests, options
         As of ``IndependentOptimum``.
-    prior
-        Of the errors that readings share.
+    coverage
+        The errors that readings share.
     """
 
     view: View
     field_map: QueryableMap
     tests: dict[int, Determinacy]
     options: OneKeyOptions
-    prior: WeightsPrior
+    coverage: Coverage
 
     @property
     def budget(self) -> Budget:
         """Processes that its graph has."""
-        return self.prior.coverage.budget
+        return self.coverage.budget
 
     @classmethod
     def of(cls, near: IndependentOptimum, budget: Budget = NOTHING_FOUND) -> "UncertainDrive":
@@ -154,15 +115,14 @@ class UncertainDrive:
         coverage = cover(view, near.errors, near.estimate, lasting_s)
         moving = moving_fields(view.readings, options.moving_field_ut)
         coverage = replace(coverage, moving=moving, budget=budget)
-        return cls(view, near.field_map, near.tests, options, WeightsPrior.of(coverage))
+        return cls(view, near.field_map, near.tests, options, coverage)
 
     def beside(self, budget: Budget) -> "UncertainDrive":
         """Return the same with processes that are no errors of poses, and the map as it was asked.
 
         Errors of poses cut a drive at other knots, for which the map has to be asked again.
         """
-        coverage = replace(self.prior.coverage, budget=budget)
-        return replace(self, prior=WeightsPrior.of(coverage))
+        return replace(self, coverage=replace(self.coverage, budget=budget))
 
 
 @dataclass(frozen=True)
@@ -219,7 +179,7 @@ class UncertainProblem:
         held_at: Estimate | None = None,
         readings: Readings | None = None,
     ) -> None:
-        view, field_map, coverage = drive.view, drive.field_map, drive.prior.coverage
+        view, field_map, coverage = drive.view, drive.field_map, drive.coverage
         view = view if readings is None else replace(view, readings=readings)
         self.drive, self.estimate = drive, estimate
         self.batch = batch_readings(view.readings, field_map)
@@ -235,7 +195,7 @@ class UncertainProblem:
         self.graph = gtsam.NonlinearFactorGraph()
         for group in self.groups:
             self.graph.push_back(_factors(group, drive.options.factors))
-        self.graph.push_back(drive.prior.graph)
+        self.graph.push_back(drive.coverage.prior)
         self.graph.push_back(self._sensor_priors)
 
     def arrive(self, values: gtsam.Values, solver: LinearSolver, *, near: bool) -> Arrival:
@@ -296,20 +256,20 @@ class UncertainProblem:
                 found.residual,
                 group.rows,
             )
-            for each, group in zip(self.groups, self.drive.prior.coverage.groups, strict=True)
+            for each, group in zip(self.groups, self.drive.coverage.groups, strict=True)
             if (found := each.linearised(values))
         ]
         owner = {key: s for s in self.drive.view.sensors for key in keys_of(s)}
         rows += rows_of_factors(self._sensor_priors.linearize(values), columns, owner)
-        at = np.concatenate([values.atVector(key) for key in self.drive.prior.coverage.sizes])
-        joint = joint_information(columns, rows, self.drive.prior.information, at)
-        spread = self.drive.prior.coverage.spread
+        at = np.concatenate([values.atVector(key) for key in self.drive.coverage.sizes])
+        joint = joint_information(columns, rows, self.drive.coverage.information, at)
+        spread = self.drive.coverage.spread
         return joint.loosened(U(), spread) if len(spread) else joint
 
     def residual(self, values: gtsam.Values) -> FloatArray:
         """Return ``e`` with the shared errors in it, uT, shape (N, 3)."""
         residual = np.empty((len(self.drive.view.readings), 3))
-        for group, readings in zip(self.drive.prior.coverage.groups, self.groups, strict=True):
+        for group, readings in zip(self.drive.coverage.groups, self.groups, strict=True):
             residual[group.rows] = readings.residual(values)
         return residual
 
@@ -327,7 +287,7 @@ class UncertainProblem:
         if take_all_noise(estimate.noise[self.drive.view.sensors]):
             return readings
         errors, residual = np.empty((len(readings), POSE)), self.residual(values)
-        groups = self.drive.prior.coverage.groups
+        groups = self.drive.coverage.groups
         for group, W in zip(groups, self.noise.whitenings, strict=True):
             weighted = W.T @ (W @ residual[group.rows].ravel())
             errors[group.rows] = pose.likely(group, weighted.reshape(-1, 3))
@@ -345,8 +305,8 @@ class UncertainProblem:
 
     def _columns(self) -> dict[int, slice]:
         """Return where each key's variables stand: weights first, then sensors."""
-        weights = self.drive.prior.coverage.columns
-        first = len(self.drive.prior.information)
+        weights = self.drive.coverage.columns
+        first = len(self.drive.coverage.information)
         own = columns_of(tuple(self.drive.view.sensors))
         return weights | {key: slice(first + at.start, first + at.stop) for key, at in own.items()}
 

@@ -182,7 +182,7 @@ class UncertainOptimum:
     def by_cause(self, solved: Sequence[SensorSolution]) -> tuple[SensorSolution, ...]:
         """Return solutions with what each cause has of their variances."""
         problem, sensors = self.problem, [each.sensor for each in solved]
-        parts = variance_parts(self.joint, problem.drive.prior, problem.noise, sensors)
+        parts = variance_parts(self.joint, problem.drive.coverage, problem.noise, sensors)
         pairs = zip(solved, parts, strict=True)
         return tuple(replace(each, variances=own) for each, own in pairs)
 
@@ -215,7 +215,7 @@ class UncertainOptimum:
 
     @property
     def _coverage(self) -> Coverage:
-        return self.problem.drive.prior.coverage
+        return self.problem.drive.coverage
 
     @cached_property
     def _residual(self) -> FloatArray:
@@ -268,9 +268,8 @@ class UncertainOptimum:
             sensors.append(NoiseBesidePoses(self._residual[counted], float(noise), left))
         if size := size_beside_noise(sensors):
             return size
-        shared = problem.drive.prior
-        keys = [key for key in shared.sizes if chr(gtsam.symbolChr(key)) == "P"]
+        keys = [key for key in self._coverage.sizes if chr(gtsam.symbolChr(key)) == "P"]
         at = columns_at(self.joint.columns, keys)
         weights = np.concatenate([self.values.atVector(key) for key in keys])
-        prior = shared.information[np.ix_(at, at)]
+        prior = self._coverage.information[np.ix_(at, at)]
         return size_of_shared(ErrorCause.POSES, self.joint, at, prior, weights)

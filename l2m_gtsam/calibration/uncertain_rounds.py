@@ -84,7 +84,7 @@ def settle_by_any(
 ) -> Settled:
     """Solve by Cholesky, and where that is refused by QR; from no shared error if not elsewhere."""
     if begin is None:
-        zero = starting_values(near, drive.view.sensors, drive.prior.coverage)
+        zero = starting_values(near, drive.view.sensors, drive.coverage)
         begin = Beginning(zero, near=False)
     for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):
         found = settle(drive, near, begin, solver, progress)

@@ -14,10 +14,10 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
+from l2m_gtsam.calibration.coverage import Coverage
 from l2m_gtsam.calibration.group_noise import GroupNoise
 from l2m_gtsam.calibration.joint_information import JointInformation, columns_at
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
-from l2m_gtsam.calibration.uncertain_graph import WeightsPrior
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import ErrorCause, VarianceShare
 
@@ -47,7 +47,7 @@ def by_cause(columns: Mapping[int, slice]) -> dict[ErrorCause, IntArray]:
 
 
 def variance_parts(
-    joint: JointInformation, prior: WeightsPrior, noise: GroupNoise, sensors: Sequence[int]
+    joint: JointInformation, coverage: Coverage, noise: GroupNoise, sensors: Sequence[int]
 ) -> tuple[Parts, ...]:
     """Return what each cause has of the variances of each sensor, by cause: t, C, H, shape (3,).
 
@@ -55,8 +55,8 @@ def variance_parts(
     ----------
     joint
         All variables, at the optimum.
-    prior
-        Of the shared errors, which come first; causes are independent of each other.
+    coverage
+        The shared errors, which come first; causes are independent of each other.
     noise
         What readings have of noise, map and poses each.
     sensors
@@ -71,9 +71,9 @@ def variance_parts(
     def add(cause: ErrorCause, values: FloatArray) -> None:
         variances[cause] = variances.get(cause, np.zeros(len(own))) + values
 
-    for cause, at in by_cause(prior.coverage.columns).items():
+    for cause, at in by_cause(coverage.columns).items():
         X = influence[at]
-        add(cause, np.einsum("ki,ki->i", X, prior.information[np.ix_(at, at)] @ X))
+        add(cause, np.einsum("ki,ki->i", X, coverage.information[np.ix_(at, at)] @ X))
     of_map, of_poses = noise.shares
     for rows in joint.rows:
         squared = (rows.jacobian @ influence[rows.columns]) ** 2

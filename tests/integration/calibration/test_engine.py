@@ -102,7 +102,7 @@ class LastGraph:
 
     def values(self, shift: FloatArray) -> gtsam.Values:
         """Where sensors are found, but for a shift of all of them in metres, shape (3,)."""
-        values = starting_values(self.estimate, self.view.sensors, self.drive.prior.coverage)
+        values = starting_values(self.estimate, self.view.sensors, self.drive.coverage)
         for sensor in self.view.sensors:
             values.update(T(sensor), values.atPoint3(T(sensor)) + shift)
         return values
@@ -122,7 +122,7 @@ def test_the_old_elimination_says_the_same(last: LastGraph, form: FactorForm) ->
     """Covariance, degrees of freedom and what is shared, of the same linear graph; rounding."""
     problem = last.problem(form)
     values = problem.polish(last.values(np.zeros(3)), 1, LinearSolver.CHOLESKY).values
-    old = eliminate(problem.graph.linearize(values), last.view.sensors, last.drive.prior.sizes)
+    old = eliminate(problem.graph.linearize(values), last.view.sensors, last.drive.coverage.sizes)
     optimum = UncertainOptimum.at(problem, values)
     joint, found = optimum.joint, optimum.solutions()
     for each in found:
