@@ -55,9 +55,10 @@ HALVINGS = 4  # into sixteen parts; eight are pairs of them
 FALSE_ALARMS = 0.002  # of calibrations whose errors are as modelled
 BLOCKS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15), "offset": slice(15, 16)}
 WHOLE = slice(0, 15)  # t, C and H together
+TESTED = BLOCKS | {"whole": WHOLE}
 NONE = np.empty(0, dtype=np.int64)
 TINY = np.finfo(np.float64).tiny
-TESTS = 4 * (len(BLOCKS) + 1)  # of a sensor: parts by time and by place, of two sizes
+TESTS = 4 * len(TESTED)  # of a sensor: parts by time and by place, of two sizes
 
 
 @dataclass(frozen=True)
@@ -130,25 +131,7 @@ class VarianceRatio:
 
 
 UNKNOWN = VarianceRatio(1.0, np.inf, 1, np.inf, 1.0)
-
-
-@dataclass(frozen=True)
-class Scatter:
-    """The scatter of one division of a drive into parts: t, C, H and time offset.
-
-    Attributes
-    ----------
-    t, C, H, offset
-        Variances of estimates over those expected.
-    whole
-        The same of t, C and H together.
-    """
-
-    t: VarianceRatio
-    C: VarianceRatio
-    H: VarianceRatio
-    offset: VarianceRatio
-    whole: VarianceRatio
+Scatter = dict[str, VarianceRatio]  # of one division of a drive into parts, by what is tested
 
 
 @dataclass(frozen=True)
@@ -224,14 +207,12 @@ def scatters(
     parts, P, found = tuple(divisions(readings, rows)), covariance.among(own), []
     if not parts:
         return ()
-    white_by = {name: whitening_of(P[block, block]) for name, block in BLOCKS.items()}
-    white_whole = whitening_of(P[WHOLE, WHOLE])
+    white = {name: whitening_of(P[block, block]) for name, block in TESTED.items()}
     for labels in parts:
         sums = gathered(rows, labels, own, covariance)
         for merged in (sums, sums.paired()):
             scores = merged.scores(covariance)
-            ratios = {name: scores.ratio(block, white_by[name]) for name, block in BLOCKS.items()}
-            found.append(Scatter(**ratios, whole=scores.ratio(WHOLE, white_whole)))
+            found.append({name: scores.ratio(at, white[name]) for name, at in TESTED.items()})
     return tuple(found)
 
 
@@ -279,13 +260,11 @@ def unmodelled(
     if not found:
         return Excess()
     P, alarms = covariance.among(own), FALSE_ALARMS / (TESTS * tests)
-    whole = max(each.whole.beyond_chance(alarms) for each in found)
-    largest = {
-        name: max(whole, *(getattr(each, name).beyond_chance(alarms) for each in found))
-        for name in BLOCKS
-    }
+    largest = {name: max(each[name].beyond_chance(alarms) for each in found) for name in TESTED}
+    whole = largest.pop("whole")
+    factors = Unmodelled(**{name: max(whole, value) for name, value in largest.items()})
     across, theirs = covariance.columns(stated)[own], covariance.among(stated)
-    return Excess(Unmodelled(**largest), whole, P - across @ np.linalg.solve(theirs, across.T))
+    return Excess(factors, whole, P - across @ np.linalg.solve(theirs, across.T))
 
 
 def halved(points: FloatArray, times: int) -> IntArray:
