@@ -1,4 +1,4 @@
-"""Where sensors are looked for: places of a lattice, and the coarse map that they meet first."""
+"""Where sensors are looked for: places of a lattice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
-from l2m_gtsam.maps.training import TrainingSet
 
 
 @dataclass(frozen=True)
@@ -65,30 +64,3 @@ class Candidates:
     def t(self, nodes: IntArray) -> FloatArray:
         """Return nodes of the box, shape (N, 3), in the lidar frame in metres."""
         return np.asarray(self.step * (self.lowest + nodes))
-
-
-class NearestReadings:
-    """A map that costs nothing to make, to find the region where a better one is evaluated.
-
-    Parameters
-    ----------
-    readings
-        Readings in the map frame, metres and uT.
-    reach
-        A place further from all readings is not known, metres.
-    """
-
-    def __init__(self, readings: TrainingSet, reach: float) -> None:
-        self._readings = readings
-        self._reach = reach
-
-    def predict(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Return the field in uT at points in metres, both of shape (N, 3), and where it is known.
-
-        Where it is not known the field is zero.
-        """
-        away, row = self._readings.tree.query(points, distance_upper_bound=self._reach)
-        known = np.isfinite(away)
-        field = np.zeros((len(points), 3))
-        field[known] = self._readings.field[np.asarray(row)[known]]
-        return field, np.asarray(known)

@@ -13,7 +13,7 @@ from pydantic import Field
 from scipy.ndimage import minimum_filter
 
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.start.candidates import Candidates, NearestReadings
+from l2m_gtsam.calibration.start.candidates import Candidates
 from l2m_gtsam.calibration.start.descent import Basin, StartProblem, descend
 from l2m_gtsam.calibration.start.rigid_groups import Bounds, Rigid, bounded, pooled, rigid_groups
 from l2m_gtsam.calibration.view import QueryableMap
@@ -270,9 +270,21 @@ def place_group(
 
 
 def coarse_prediction(field_map: QueryableMap, options: StartOptions) -> FieldPredictor:
-    """Return the nearest readings of a map that knows its own, and else the map."""
+    """Return the nearest readings of a map that knows its own, and else the map.
+
+    The first cost nothing to make: by them the region is found where the map is asked.
+    """
     if isinstance(field_map, Surveyed):
-        return NearestReadings(field_map.readings, options.reach).predict
+        readings = field_map.readings
+
+        def nearest(points: FloatArray) -> tuple[FloatArray, BoolArray]:
+            away, row = readings.tree.query(points, distance_upper_bound=options.reach)
+            known = np.isfinite(away)
+            field = np.zeros((len(points), 3))
+            field[known] = readings.field[np.asarray(row)[known]]
+            return field, np.asarray(known)
+
+        return nearest
 
     def predict(points: FloatArray) -> tuple[FloatArray, BoolArray]:
         sample = field_map.query(points)

@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import shift
 
 from l2m_gtsam.calibration.priors import Coordinate, Difference, Priors
 from l2m_gtsam.data import FloatArray
@@ -133,25 +134,18 @@ def pooled(left: FloatArray, groups: Sequence[Rigid], step: float) -> FloatArray
     for group in groups:
         shifts = np.round(group.offset / step).astype(int)
         parts = [
-            np.log(np.maximum(moved(left[..., sensor], shift), TINY))
-            for sensor, shift in zip(group.sensors, shifts, strict=True)
+            np.log(np.maximum(moved(left[..., sensor], by), TINY))
+            for sensor, by in zip(group.sensors, shifts, strict=True)
             if np.isfinite(left[..., sensor]).any()
         ]
         if parts:
             # Profile likelihoods multiply; of n readings each goes as rms^-3n, any noise.
             mean = np.exp(np.mean(parts, axis=0))
-            for sensor, shift in zip(group.sensors, shifts, strict=True):
-                left[..., sensor] = moved(mean, -shift)
+            for sensor, by in zip(group.sensors, shifts, strict=True):
+                left[..., sensor] = moved(mean, -by)
     return left
 
 
 def moved(values: FloatArray, by: FloatArray) -> FloatArray:
     """Return values (nx, ny, nz) of the nodes so many steps on; infinite beyond the last."""
-    result = np.full(values.shape, np.inf)
-    sizes = np.array(values.shape)
-    low, high = np.maximum(0, -by), np.minimum(sizes, sizes - by)
-    if (high > low).all():
-        to = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        source = tuple(slice(a, b) for a, b in zip(low + by, high + by, strict=True))
-        result[to] = values[source]
-    return result
+    return np.asarray(shift(values, -by, order=0, cval=np.inf))
