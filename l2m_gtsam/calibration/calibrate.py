@@ -265,17 +265,8 @@ def _starts(
     priors: Priors,
     progress: Progress,
 ) -> list[FoundStart | None]:
-    """Look for the start of each sensor; none where it is given or none is found.
-
-    Raises
-    ------
-    CalibrationError
-        A start is given for a sensor that the recording does not have.
-    """
-    if unknown := sorted(set(options.start) - set(readings.sensors)):
-        sensors = ", ".join(readings.sensors)
-        msg = f"start: no sensor named {unknown[0]!r}; the recording has {sensors}"
-        raise CalibrationError(msg)
+    """Look for the start of each sensor; none where it is given or none is found."""
+    check_starts(readings.sensors, options)
     if not len(readings) or set(options.start) == set(readings.sensors):
         return [None] * len(readings.sensors)
     progress("global start", 0.0)
@@ -283,6 +274,13 @@ def _starts(
     progress("global start", 1.0)
     names = zip(readings.sensors, found, strict=True)
     return [None if name in options.start else each for name, each in names]
+
+
+def check_starts(sensors: tuple[str, ...], options: CalibrationOptions) -> None:
+    """Raise a CalibrationError for a start of a sensor that the recording does not have."""
+    if unknown := sorted(set(options.start) - set(sensors)):
+        msg = f"start: no sensor named {unknown[0]!r}; the recording has {', '.join(sensors)}"
+        raise CalibrationError(msg)
 
 
 def is_ambiguous(found: list[FoundStart | None], options: CalibrationOptions) -> bool:

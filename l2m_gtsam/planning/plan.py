@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.calibration.calibrate import covers, not_covered, prepare
+from l2m_gtsam.calibration.calibrate import check_starts, covers, not_covered, prepare
 from l2m_gtsam.calibration.explanation import from_priors, undetermined
 from l2m_gtsam.calibration.extent import extent_of
 from l2m_gtsam.calibration.forecast import Forecast, forecast
@@ -244,9 +244,7 @@ def _noise(
 
 def _places(sensors: tuple[str, ...], options: CalibrationOptions, priors: Priors) -> FloatArray:
     """Return where sensors are assumed in metres, shape (S, 3)."""
-    if unknown := sorted(set(options.start) - set(sensors)):
-        msg = f"start: no sensor named {unknown[0]!r}; the recording has {', '.join(sensors)}"
-        raise CalibrationError(msg)
+    check_starts(sensors, options)
     at_lidar = (0.0, 0.0, 0.0)
     t = np.array([options.start.get(name, at_lidar) for name in sensors])
     given = [index for index, name in enumerate(sensors) if name in options.start]
