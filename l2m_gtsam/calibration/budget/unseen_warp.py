@@ -58,11 +58,11 @@ def unseen_warp(known: ProcessInformation, before_m: float) -> UnseenWarp:
     before_m
         How large it is beforehand: standard deviation of shifts in metres.
     """
-    modes = WarpModes.of(known)
-    sizes = WarpSizes.of(modes.informed, np.square(modes.pull), before_m)
-    mean = sizes.variance * modes.pull
-    moments = np.diag(sizes.posterior @ sizes.variance) + (mean.T * sizes.posterior) @ mean
-    return UnseenWarp(sizes.rms, modes.of_estimate @ cholesky(moments, lower=True))
+    informed, pull, of_estimate = warp_modes(known)
+    posterior, variance, rms = posterior_of(informed, np.square(pull), before_m)
+    mean = variance * pull
+    moments = np.diag(posterior @ variance) + (mean.T * posterior) @ mean
+    return UnseenWarp(rms, of_estimate @ cholesky(moments, lower=True))
 
 
 def foretold_warp(known: ProcessInformation, before_m: float) -> UnseenWarp:
@@ -71,67 +71,49 @@ def foretold_warp(known: ProcessInformation, before_m: float) -> UnseenWarp:
     Noise alone pulls at each eigenvector by the root of its information. Parameters are those of
     ``unseen_warp``, the pull being nothing.
     """
-    modes = WarpModes.of(known)
-    sizes = WarpSizes.of(modes.informed, modes.informed, before_m)
-    moments = sizes.posterior @ (sizes.variance + np.square(sizes.variance) * modes.informed)
-    return UnseenWarp(sizes.rms, modes.of_estimate * np.sqrt(moments))
+    informed, _, of_estimate = warp_modes(known)
+    posterior, variance, rms = posterior_of(informed, informed, before_m)
+    moments = posterior @ (variance + np.square(variance) * informed)
+    return UnseenWarp(rms, of_estimate * np.sqrt(moments))
 
 
-@dataclass(frozen=True)
-class WarpModes:
-    """The weights of a warp of unit size along the eigenvectors of what readings say of them.
+def warp_modes(known: ProcessInformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a warp of unit size along the eigenvectors of what readings say of its weights.
 
-    Attributes
-    ----------
+    Returns
+    -------
     informed, pull
         Information and pull of each, shapes (m,).
     of_estimate
         What a unit of each moves all variables of the graph by, shape (n, m).
     """
-
-    informed: FloatArray
-    pull: FloatArray
-    of_estimate: FloatArray
-
-    @classmethod
-    def of(cls, known: ProcessInformation) -> "WarpModes":
-        """Return the modes of the only process that is looked for."""
-        (warp,) = known.processes
-        unit = np.sqrt(warp.forms[0].mean(axis=0))  # both lengths alike
-        informed, axes = np.linalg.eigh(unit[:, None] * known.system.information * unit)
-        pull = axes.T @ (unit * known.system.pull)
-        return cls(np.maximum(informed, 0.0), pull, known.influence @ (unit[:, None] * axes))
+    (warp,) = known.processes  # nothing else is looked for
+    unit = np.sqrt(warp.forms[0].mean(axis=0))  # both lengths alike
+    informed, axes = np.linalg.eigh(unit[:, None] * known.system.information * unit)
+    pull = axes.T @ (unit * known.system.pull)
+    return np.maximum(informed, 0.0), pull, known.influence @ (unit[:, None] * axes)
 
 
-@dataclass(frozen=True)
-class WarpSizes:
-    """The posterior of a warp's size on a grid.
+def posterior_of(
+    informed: FloatArray, squared_pull: FloatArray, before_m: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the posterior of a warp's size on a grid, by what is known of its modes, shapes (m,).
 
-    Attributes
-    ----------
-    size, posterior
-        In metres, and how likely, shapes (G,).
+    Returns
+    -------
+    posterior
+        How likely each size is, shape (G,).
     variance
         Of each mode where the size is known, shape (G, m).
+    rms
+        Root mean square of the size, metres.
     """
-
-    size: FloatArray
-    posterior: FloatArray
-    variance: FloatArray
-
-    @classmethod
-    def of(cls, informed: FloatArray, squared_pull: FloatArray, before_m: float) -> "WarpSizes":
-        """Return it for information and squared pull of the modes, shapes (m,)."""
-        size = before_m * np.geomspace(SMALLEST, LARGEST, SIZES)
-        prior = np.square(size)[:, None]
-        variance = prior / (1 + prior * informed)
-        likelihood = 0.5 * (squared_pull * variance - np.log1p(prior * informed)).sum(axis=1)
-        beforehand = -0.5 * np.square(size / before_m)
-        # The steps of a geometric grid are as long as the sizes.
-        posterior = size * np.exp(likelihood - likelihood.max() + beforehand)
-        return cls(size, posterior / posterior.sum(), variance)
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of the size, metres."""
-        return float(np.sqrt(self.posterior @ np.square(self.size)))
+    size = before_m * np.geomspace(SMALLEST, LARGEST, SIZES)
+    prior = np.square(size)[:, None]
+    variance = prior / (1 + prior * informed)
+    likelihood = 0.5 * (squared_pull * variance - np.log1p(prior * informed)).sum(axis=1)
+    beforehand = -0.5 * np.square(size / before_m)
+    # The steps of a geometric grid are as long as the sizes.
+    posterior = size * np.exp(likelihood - likelihood.max() + beforehand)
+    posterior /= posterior.sum()
+    return posterior, variance, float(np.sqrt(posterior @ np.square(size)))
