@@ -166,7 +166,7 @@ def size_of_shared(
     """
     system = without_prior(joint.every.among(at), prior, weights)
     found = system.components(np.ones((1, len(at))))
-    as_stated = system.posterior(np.ones(len(at))).likelihood
+    as_stated = system.fit(np.ones(len(at))).likelihood
     return StatedSize(cause, float(np.sqrt(found.sizes[0])), found.gain - 2 * as_stated)
 
 

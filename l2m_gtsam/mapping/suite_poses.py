@@ -155,7 +155,7 @@ def widened(survey: PosedSurvey, seen: Sequence[PosesInWindow]) -> SuiteRound:
     last, left, noise = survey.last, [], noise_beside([each.view for each in seen])
     for slopes, each in zip(survey.slopes, seen, strict=True):
         unit = np.ones(len(each.view.part))
-        likeliest = each.view.system.whiter(noise).posterior(unit).rest
+        likeliest = each.view.system.whiter(noise).fit(unit).rest
         left.append(slopes.residual - slopes.beside_field(each.effects @ likeliest))
     # What is alike beyond that, as of waves that are left out.
     alike = noise * likeness(last.windows, left)

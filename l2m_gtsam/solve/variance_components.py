@@ -77,8 +77,8 @@ class VarianceComponents:
 
 
 @dataclass(frozen=True)
-class WeightPosterior:
-    """Weights under a prior.
+class WeightFit:
+    """What a prior of weights is worth.
 
     Attributes
     ----------
@@ -86,23 +86,6 @@ class WeightPosterior:
         Its logarithm beyond that without weights.
     rest
         q, what the pull is that the weights leave, shape (m,).
-    root
-        Z with ``M = I - Z^T Z``, shape (k, m), of the k weights that may differ from zero.
-    """
-
-    likelihood: float
-    rest: FloatArray
-    root: FloatArray
-
-
-@dataclass(frozen=True)
-class WeightFit:
-    """What a prior of weights is worth.
-
-    Attributes
-    ----------
-    likelihood, rest
-        As of ``WeightPosterior``.
     share
         How much of each weight's prior variance the readings take away, shape (m,).
     """
@@ -136,32 +119,20 @@ class WeightSystem:
 
         What is left of the weights is what they are beyond that.
         """
-        found = self.posterior(variances)
-        return WeightSystem(self.information - found.root.T @ found.root, found.rest)
-
-    def posterior(self, variances: FloatArray) -> WeightPosterior:
-        """Return what the readings make of weights of these prior variances, shape (m,)."""
-        at = np.flatnonzero(variances > 0)
-        root, I_at = np.sqrt(variances[at]), self.information[at]
-        lower = self.among(at)._factor(root)
-        white = solve_triangular(
-            lower, root[:, None] * np.column_stack([I_at, self.pull[at]]), lower=True
-        )
-        Z, v = white[:, :-1], white[:, -1]
-        likelihood = 0.5 * float(v @ v) - float(np.log(np.diag(lower)).sum())
-        return WeightPosterior(likelihood, self.pull - Z.T @ v, Z)
+        return self.left_to(variances, np.arange(len(self.pull)))
 
     def left_to(self, variances: FloatArray, at: IntArray) -> "WeightSystem":
         """Return ``beside(variances).among(at)``, at the cost of these weights only."""
-        root = np.sqrt(variances)
-        lower = self._factor(root)
-        own = np.column_stack([self.information[:, at], self.pull]) * root[:, None]
-        white = solve_triangular(lower, own, lower=True, check_finite=False)
+        may = np.flatnonzero(variances > 0)
+        root = np.sqrt(variances[may])
+        lower = self.among(may)._factor(root)
+        own = np.column_stack([self.information[np.ix_(may, at)], self.pull[may]])
+        white = solve_triangular(lower, root[:, None] * own, lower=True, check_finite=False)
         Z, v = white[:, :-1], white[:, -1]
         return WeightSystem(self.information[np.ix_(at, at)] - Z.T @ Z, self.pull[at] - Z.T @ v)
 
     def fit(self, variances: FloatArray) -> WeightFit:
-        """Return what a prior of these variances, shape (m,), is worth: a third of ``posterior``.
+        """Return what a prior of these variances, shape (m,), is worth.
 
         With ``K = (1 + S^1/2 I S^1/2)^-1`` it is ``S^1/2 M S^1/2 = 1 - K``.
         """

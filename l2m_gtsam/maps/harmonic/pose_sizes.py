@@ -181,7 +181,7 @@ def gain_elsewhere(views: Sequence[PoseView], fit: VarianceComponents) -> float:
 
 def gain_as_stated(seen: Sequence[PoseView]) -> float:
     """Return the logarithm of likelihood of stated errors that last, beyond that of exact poses."""
-    return sum(each.system.posterior(np.ones(len(each.part))).likelihood for each in seen)
+    return sum(each.system.fit(np.ones(len(each.part))).likelihood for each in seen)
 
 
 def noise_beside(seen: Sequence[PoseView]) -> float:

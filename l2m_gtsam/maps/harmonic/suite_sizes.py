@@ -168,7 +168,7 @@ def stated_size(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> StatedSize 
     system = view.system.beside((~judged).astype(float)).among(np.flatnonzero(judged))
     alike = np.ones((1, int(judged.sum())))
     found = system.components_and_noise(alike, view.squares)
-    gain = found.gain - 2 * system.whiter(found.noise).posterior(alike[0]).likelihood
+    gain = found.gain - 2 * system.whiter(found.noise).fit(alike[0]).likelihood
     return StatedSize(ErrorCause.SUITE, max(float(np.sqrt(found.sizes[0])), SMALLEST), gain)
 
 

@@ -37,7 +37,7 @@ def test_the_likelihood_is_that_of_the_readings(seed: int, shown: int) -> None:
     on = np.array([shown >> k & 1 for k in range(WEIGHTS)])
     variances = on * rng.gamma(1.0, 1.0, WEIGHTS)
     Z, y = drawn(rng, variances)
-    found = system(Z, y).posterior(variances)
+    found = system(Z, y).fit(variances)
     # Rounding of sums over 60 readings.
     np.testing.assert_allclose(found.likelihood, dense(Z, y, variances), atol=1e-9)
     V = np.eye(ROWS) + (Z * variances) @ Z.T
@@ -49,9 +49,9 @@ def test_what_is_beside_others_is_what_is_left_in_their_presence() -> None:
     own, others = np.repeat([1.0, 0.0], [4, 5]), np.repeat([0.0, 2.0], [4, 5])
     Z, y = drawn(rng, own + others)
     left = system(Z, y).beside(others)
-    gain = left.posterior(own).likelihood
+    gain = left.fit(own).likelihood
     every = system(Z, y)
-    expected = every.posterior(own + others).likelihood - every.posterior(others).likelihood
+    expected = every.fit(own + others).likelihood - every.fit(others).likelihood
     np.testing.assert_allclose(gain, expected, atol=1e-9)
 
 
@@ -62,7 +62,7 @@ def test_sizes_are_where_the_likelihood_is_largest() -> None:
     found = system(Z, y).components(spectra)
     best = found.gain / 2
     for factors in ((1.3, 1.0), (0.75, 1.0), (1.0, 1.3), (1.0, 0.75)):
-        there = system(Z, y).posterior((found.sizes * factors) @ spectra).likelihood
+        there = system(Z, y).fit((found.sizes * factors) @ spectra).likelihood
         # The last update gained less than 0.02.
         assert there < best + 0.02
 
@@ -148,4 +148,4 @@ def test_information_that_rounding_made_indefinite_has_sizes_all_the_same() -> N
     found = known.components(spectra)
     assert np.isfinite(found.sizes).all()
     assert found.gain > 0
-    assert np.isfinite(known.posterior(np.full(WEIGHTS, 1e4)).rest).all()
+    assert np.isfinite(known.fit(np.full(WEIGHTS, 1e4)).rest).all()
