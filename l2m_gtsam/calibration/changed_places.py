@@ -13,7 +13,7 @@ from l2m_gtsam.calibration.averaged_rows import AveragedDrive, pose_shares
 from l2m_gtsam.calibration.averages import AveragingOptions, averaged
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.coverage import UncertainMap, errors_over_stated
-from l2m_gtsam.calibration.drive_sources import drive_sources, offset_gain
+from l2m_gtsam.calibration.drive_sources import REJECTED, drive_sources, offset_gain
 from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, places_of
@@ -149,7 +149,9 @@ def search(
     budget = NOTHING_FOUND if known is None else solution.budget
     rows = drive.marginal(field_map, field_map, budget, options.averaging)
     shown = drive_sources(rows, drive, places, field_map, options.sources, known)
-    if not len(shown.found) or shown.gain < offset_gain(shown.rows, drive):
+    # Something on the vehicle that is switched does that, alike at all places.
+    switched = offset_gain(shown.rows, drive, drive.averages.counted < REJECTED)
+    if not len(shown.found) or shown.gain < switched:
         return None
     return ChangedSources(shown.found, shown.changed(), shown.missed_places)
 

@@ -220,11 +220,10 @@ def explanations(
     own_offset = gains(rows, offsets, pulled, 3)
     size = float(np.sqrt(np.mean(np.sum(field[passage >= 0] ** 2, axis=1))))
     one = price(rows, 1)
-    place = float(gains(rows, field[:, :, None], pulled, 1)[0]) - one
+    place = amplitudes(rows, field[:, :, None], pulled)[0] - one
     moment = float(per_passage.max() - one - 2 * np.log(len(per_passage)))
     alone = max(float(per_sensor.max()) - one, float(own_offset.max()) - 3 * one)
-    width = offsets.shape[2]
-    vehicle = float(gains(rows, offsets, pulled, width)[0]) - width * one
+    vehicle = amplitudes(rows, offsets, pulled)[0] - offsets.shape[2] * one
     found = [
         CauseGain(Cause.PLACE, place, size),
         CauseGain(Cause.MOMENT, moment, size),
@@ -236,25 +235,14 @@ def explanations(
     return tuple(sorted(found, key=lambda each: -each.gain))
 
 
-def offset_gain(rows: MarginalRows, drive: AveragedDrive) -> float:
-    """Return what offsets of the sensors explain, on wherever readings were rejected (a BIC).
-
-    Something on the vehicle that is switched does that, alike at all places.
-    """
-    on = drive.averages.counted < REJECTED
-    return _offsets_explain(rows, drive, on) if on.any() else 0.0
-
-
-def vehicle_gain(rows: MarginalRows, drive: AveragedDrive) -> float:
-    """Return what offsets of the sensors explain that are on all along a drive (a BIC)."""
-    return _offsets_explain(rows, drive, np.ones(len(rows), dtype=np.bool_))
-
-
-def _offsets_explain(rows: MarginalRows, drive: AveragedDrive, on: BoolArray) -> float:
+def offset_gain(rows: MarginalRows, drive: AveragedDrive, on: BoolArray) -> float:
+    """Return what offsets of the sensors explain that are on at some readings, (N,) (a BIC)."""
+    if not on.any():
+        return 0.0
     features = sensor_offsets(drive) * on[:, None, None]
     pulled, _ = rows.pull(rows.residual)
-    width = features.shape[2]
-    return float(gains(rows, features, pulled, width)[0]) - price(rows, width)
+    gain, offsets = amplitudes(rows, features, pulled)
+    return gain - price(rows, len(offsets))
 
 
 def sensor_offsets(drive: AveragedDrive) -> FloatArray:
@@ -284,10 +272,14 @@ def gains(rows: MarginalRows, features: FloatArray, pulled: FloatArray, width: i
     numpy.ndarray
         Twice the logarithm of each group's likelihood ratio, if it may be of any strength, (G,).
     """
+    groups = np.split(features, features.shape[2] // width, axis=2)
+    return np.array([amplitudes(rows, each, pulled)[0] for each in groups])
+
+
+def amplitudes(
+    rows: MarginalRows, features: FloatArray, pulled: FloatArray
+) -> tuple[float, FloatArray]:
+    """Return the same of M fields that are one group, and their likeliest strengths, shape (M,)."""
     F, g = rows.information(features), np.einsum("nim,ni->m", features, pulled)
-    found = []
-    for first in range(0, len(g), width):
-        own = slice(first, first + width)
-        x, *_ = np.linalg.lstsq(F[own, own], g[own], rcond=1e-10)
-        found.append(float(g[own] @ x))
-    return np.array(found)
+    x, *_ = np.linalg.lstsq(F, g, rcond=1e-10)
+    return float(g @ x), x

@@ -19,7 +19,12 @@ import numpy as np
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive
 from l2m_gtsam.calibration.changed_places import CELL_M, ChangesOptions, averaged_drive, is_place_of
 from l2m_gtsam.calibration.coverage import UncertainMap
-from l2m_gtsam.calibration.drive_sources import REJECTED, passages_of, sensor_offsets
+from l2m_gtsam.calibration.drive_sources import (
+    REJECTED,
+    amplitudes,
+    passages_of,
+    sensor_offsets,
+)
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
@@ -147,24 +152,20 @@ class CellCauses:
         """Return the causes of a drive."""
         pulled, _ = rows.pull(rows.residual)
         offsets = sensor_offsets(drive) * wrong[:, None, None]
-        F, g = rows.information(offsets), np.einsum("nim,ni->m", offsets, pulled)
-        switched, *_ = np.linalg.lstsq(F, g, rcond=1e-10)
+        _, switched = amplitudes(rows, offsets, pulled)
         return cls(rows, drive, pulled, wrong, offsets, switched, price(rows, 1))
 
     def explained(self, here: BoolArray) -> dict[Cause, CauseGain]:
         """Return gain and size of every cause in a cell whose readings are given, shape (N,)."""
         passage = passages_of(self.drive.averages.slot, here)
         passes = [passage == p for p in range(int(passage.max()) + 1)]
-        sensors = [here & (self.drive.view.readings.sensor == s) for s in self._present()]
-        uniform = np.eye(AXES)
+        sensor, uniform = self.drive.view.readings.sensor, np.eye(AXES)
+        sensors = [here & (sensor == s) for s in np.unique(sensor)]
         place = self._free(here[:, None, None] * uniform)
-        moment = max((self._free(own[:, None, None] * uniform) for own in passes), key=_first)
+        moment = max(self._free(own[:, None, None] * uniform) for own in passes)
         alone = max(
-            (
-                self._free(own[:, None, None] * self.offsets[:, :, 3 * k : 3 * k + 3])
-                for k, own in enumerate(sensors)
-            ),
-            key=_first,
+            self._free(own[:, None, None] * self.offsets[:, :, 3 * k : 3 * k + 3])
+            for k, own in enumerate(sensors)
         )
         found = {
             Cause.PLACE: place,
@@ -175,15 +176,10 @@ class CellCauses:
             found[Cause.SENSOR] = alone[0] - 2 * np.log(len(sensors)), alone[1]
         return {cause: CauseGain(cause, float(gain), size) for cause, (gain, size) in found.items()}
 
-    def _present(self) -> list[int]:
-        return [int(s) for s in np.unique(self.drive.view.readings.sensor)]
-
     def _free(self, features: FloatArray) -> tuple[float, float]:
         """Return the gain (a BIC) and the size in uT of fields of three free amplitudes."""
-        F = self.rows.information(features)
-        g = np.einsum("nim,ni->m", features, self.pulled)
-        x, *_ = np.linalg.lstsq(F, g, rcond=1e-10)
-        return float(g @ x) - len(g) * self.one, _size(features @ x)
+        gain, x = amplitudes(self.rows, features, self.pulled)
+        return gain - len(x) * self.one, _size(features @ x)
 
     def _vehicle(self, here: BoolArray) -> tuple[float, float]:
         """Return the same of the offsets that all rejected readings have; each cell pays a part."""
@@ -192,10 +188,6 @@ class CellCauses:
         gain = 2 * float(np.sum(field * self.pulled)) - own
         share = np.count_nonzero(self.wrong & here) / np.count_nonzero(self.wrong)
         return gain - share * len(self.switched) * self.one, _size(field)
-
-
-def _first(found: tuple[float, float]) -> float:
-    return found[0]
 
 
 def _size(field: FloatArray) -> float:

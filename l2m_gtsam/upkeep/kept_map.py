@@ -13,7 +13,7 @@ from l2m_gtsam.calibration.averages import averaged
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected
 from l2m_gtsam.calibration.coverage import errors_over_stated
-from l2m_gtsam.calibration.drive_sources import drive_sources, vehicle_gain
+from l2m_gtsam.calibration.drive_sources import drive_sources, offset_gain
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.view import places_of
@@ -107,7 +107,9 @@ def seen_sources(
     free = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
     rows = with_calibration(free, covariances(known))
     shown = drive_sources(rows, drive, places, field_map, options.sources)
-    vehicle = max(vehicle_gain(shown.rows, drive), calibration_gain(rows, free, len(known)))
+    along = np.ones(len(rows), dtype=np.bool_)
+    vehicle = offset_gain(shown.rows, drive, along)
+    vehicle = max(vehicle, calibration_gain(rows, free, len(known)))
     return SeenSources(shown.changed(), shown.gain, vehicle)
 
 
