@@ -45,11 +45,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
+from l2m_gtsam.calibration.joint_information import Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.error_budget import EXPLAINED, Unmodelled
 from l2m_gtsam.solve.chi_square import quantile
+from l2m_gtsam.solve.linear_algebra import submatrix
 
 HALVINGS = 4  # into sixteen parts; eight are pairs of them
 FALSE_ALARMS = 0.002  # of calibrations whose errors are as modelled
@@ -189,7 +190,7 @@ def directions_of(scores: FloatArray) -> float:
 
 
 def scatters(
-    readings: Readings, rows: Sequence[Rows], own: IntArray, covariance: HalfCovariance
+    readings: Readings, rows: Sequence[Rows], own: IntArray, covariance: FloatArray
 ) -> tuple[Scatter, ...]:
     """Return the scatter of parts by time and by place, of two sizes; none of few readings.
 
@@ -202,9 +203,9 @@ def scatters(
     own
         Where its sixteen parameters stand among all n variables, shape (16,).
     covariance
-        Of all n variables.
+        Of all n variables, shape (n, n).
     """
-    parts, P, found = tuple(divisions(readings, rows)), covariance.among(own), []
+    parts, P, found = tuple(divisions(readings, rows)), submatrix(covariance, own), []
     if not parts:
         return ()
     white = {name: whitening_of(P[block, block]) for name, block in TESTED.items()}
@@ -238,7 +239,7 @@ def divisions(readings: Readings, rows: Sequence[Rows]) -> Iterator[IntArray]:
 def unmodelled(
     found: Sequence[Scatter],
     own: IntArray,
-    covariance: HalfCovariance,
+    covariance: FloatArray,
     tests: int,
     stated: IntArray = NONE,
 ) -> Excess:
@@ -251,7 +252,7 @@ def unmodelled(
     own
         Where its sixteen parameters stand among all n variables, shape (16,).
     covariance
-        Of all n variables.
+        Of all n variables, shape (n, n).
     tests
         Number of sensors that are tested together.
     stated
@@ -259,11 +260,11 @@ def unmodelled(
     """
     if not found:
         return Excess()
-    P, alarms = covariance.among(own), FALSE_ALARMS / (TESTS * tests)
+    P, alarms = submatrix(covariance, own), FALSE_ALARMS / (TESTS * tests)
     largest = {name: max(each[name].beyond_chance(alarms) for each in found) for name in TESTED}
     whole = largest.pop("whole")
     factors = Unmodelled(**{name: max(whole, value) for name, value in largest.items()})
-    across, theirs = covariance.columns(stated)[own], covariance.among(stated)
+    across, theirs = covariance[np.ix_(own, stated)], submatrix(covariance, stated)
     return Excess(factors, whole, P - across @ np.linalg.solve(theirs, across.T))
 
 
@@ -313,18 +314,19 @@ class Gathered:
         sums = (each[::2] + each[1::2] for each in (self.found, self.brought, self.crossed))
         return Gathered(*sums)
 
-    def scores(self, covariance: HalfCovariance) -> Scores:
+    def scores(self, covariance: FloatArray) -> Scores:
         """Return scores of sixteen parameters among all variables, and what is expected of them."""
         expected = self.brought.copy()
         for at, crossed in zip(expected, self.crossed, strict=True):
             # Of thousands of variables a part touches hundreds.
             touched = np.flatnonzero(crossed.any(axis=1))
-            at -= covariance.across(touched, crossed[touched])
+            among = submatrix(covariance, touched)
+            at -= crossed[touched].T @ among @ crossed[touched]
         return Scores(self.found, expected)
 
 
 def gathered(
-    rows: Sequence[Rows], labels: IntArray, own: IntArray, covariance: HalfCovariance
+    rows: Sequence[Rows], labels: IntArray, own: IntArray, covariance: FloatArray
 ) -> Gathered:
     """Return the sums of white rows by the labels of their readings.
 
@@ -340,9 +342,9 @@ def gathered(
     own
         Where the sensor's parameters stand among all variables, shape (16,).
     covariance
-        Of all n variables.
+        Of all n variables, shape (n, n).
     """
-    parts, influence = 2**HALVINGS, covariance.columns(own)
+    parts, influence = 2**HALVINGS, covariance[:, own]
     found, brought = np.zeros((parts, SENSOR)), np.zeros((parts, SENSOR, SENSOR))
     crossed = np.zeros((parts, len(covariance), SENSOR))
     for each in rows:

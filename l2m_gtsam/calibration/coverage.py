@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 import gtsam
 import numpy as np
 from scipy.linalg import cholesky
-from scipy.linalg.lapack import dpotri, dtrtri
+from scipy.linalg.lapack import dtrtri
 
 from l2m_factors import M, P, Q, SharedError, U, map_weights_information, pose_errors_prior
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
@@ -23,6 +23,7 @@ from l2m_gtsam.calibration.pose_errors import PoseKnots, pose_seconds
 from l2m_gtsam.calibration.view import View, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.solve.linear_algebra import inverse_of_factor
 
 POSE = 6  # weights of a knot
 # Readings of a group: what is left of their poses' error is a matrix of three times as many rows.
@@ -275,10 +276,7 @@ class Coverage:
     @cached_property
     def tile_information(self) -> FloatArray:
         """Information of all tiles' weights, shape (K, K)."""
-        lower, _ = dpotri(self.lower, lower=1)  # above its diagonal as the root: zero
-        whole = lower + lower.T
-        whole[np.diag_indices_from(whole)] = lower.diagonal()
-        return np.asarray(whole)
+        return inverse_of_factor(self.lower.copy())  # the root itself is needed again
 
     @property
     def sizes(self) -> dict[int, int]:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
+from l2m_gtsam.calibration.joint_information import Rows
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
 from l2m_gtsam.geometry import undetermined
 
@@ -112,7 +112,7 @@ def half_differences(
     groups: Sequence[WhiteGroup],
     later: BoolArray,
     halved: Mapping[int, HalvedSensor],
-    every: HalfCovariance,
+    every: FloatArray,
     loose: FloatArray,
 ) -> dict[int, HalfDifference]:
     """Return the differences of sensors.
@@ -126,7 +126,7 @@ def half_differences(
     halved
         The sensors by their index.
     every
-        Covariance of all variables.
+        Covariance of all n variables, shape (n, n).
     loose
         What it has beyond that of the system of which the rows are, a root, shape (n, l).
     """
@@ -142,7 +142,7 @@ def half_differences(
         pull[at] -= Z.T @ each.rows.residual
         across[each.rows.columns, at] += each.rows.jacobian.T @ Z
     by_loose = loose.T @ across
-    followed = every.times(across) - loose @ by_loose  # all variables as d goes on
+    followed = every @ across - loose @ by_loose  # all variables as d goes on
     information = alone - across.T @ followed
     found, covariance = solved(information, np.diag(alone), pull, by_loose)
     squares = dict.fromkeys(halved, 0.0)

@@ -19,7 +19,7 @@ from l2m_gtsam.calibration.factor_graph import (
     whitened_jacobian,
 )
 from l2m_gtsam.calibration.half_difference import HalfDifference
-from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
+from l2m_gtsam.calibration.joint_information import Rows
 from l2m_gtsam.calibration.optimise import (
     NEARLY,
     TOLERANCE,
@@ -316,7 +316,7 @@ def robust_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
         residual = problem.batch.residuals(values, s).residual[rows]
         white = (W[rows] @ residual[:, :, None]).ravel()
         own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
-        covariance, together = HalfCovariance.of(optimum.among((s,))), len(problem.view.sensors)
+        covariance, together = optimum.among((s,)), len(problem.view.sensors)
         parts = scatters(problem.view.readings, [own], OWN, covariance)
         excess = unmodelled(parts, OWN, covariance, together)
         widened.append(found.widened(excess))

@@ -21,13 +21,11 @@ from functools import cached_property
 import gtsam
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky
-from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotri
 
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.solve.linear_algebra import add_upper, submatrix
+from l2m_gtsam.solve.linear_algebra import add_upper, inverse_of_factor, submatrix
 
 SHARED = -1  # of rows that are no one sensor's
 NO_READINGS = np.empty(0, dtype=np.int64)
@@ -57,113 +55,16 @@ class Rows:
     readings: IntArray
 
 
-@dataclass(frozen=True)
-class HalfCovariance:
-    """A covariance Sigma of n variables as its half U, with ``U + U^T = Sigma``.
+def blocks(covariance: FloatArray, J: FloatArray, size: int) -> FloatArray:
+    """Return the blocks of ``J Sigma J^T`` about its diagonal, shape (m / size, size, size).
 
-    Between one matrix on both sides U is as good as the whole, and half as much to read.
-
-    Attributes
-    ----------
-    scale
-        Unit of each variable, shape (n,).
-    half
-        U in these units, upper triangular, shape (n, n).
+    Of a covariance Sigma, shape (k, k), and J, shape (m, k).
     """
-
-    scale: FloatArray
-    half: FloatArray
-
-    @classmethod
-    def of(cls, covariance: FloatArray) -> "HalfCovariance":
-        """Return a covariance that is there as a whole, shape (n, n)."""
-        half = np.triu(covariance)
-        half[np.diag_indices_from(half)] *= 0.5
-        return cls(np.ones(len(half)), half)
-
-    @classmethod
-    def from_factor(cls, lower: FloatArray, scale: FloatArray) -> "HalfCovariance":
-        """Return the inverse of a scaled information from its Cholesky factor, which it overwrites.
-
-        Parameters
-        ----------
-        lower
-            The factor with zeros above its diagonal, in Fortran order, shape (n, n).
-        scale
-            Unit of each variable, shape (n,).
-        """
-        inverse, _ = dpotri(lower, lower=1, overwrite_c=1)  # above the diagonal zeros stay
-        inverse[np.diag_indices_from(inverse)] *= 0.5
-        return cls(scale, inverse.T)
-
-    def __len__(self) -> int:
-        return len(self.scale)
-
-    def among(self, at: IntArray) -> FloatArray:
-        """Return the covariance of some variables in their order, shape (k, k)."""
-        half = submatrix(self.half, at)
-        return np.asarray((half + half.T) * self.scale[at] * self.scale[at, None])
-
-    def across(self, at: IntArray, A: FloatArray) -> FloatArray:
-        """Return ``A^T Sigma A`` for A of some variables, shape (k, m); the result is (m, m)."""
-        scaled = A * self.scale[at, None]
-        half = scaled.T @ submatrix(self.half, at) @ scaled
-        return np.asarray(half + half.T)
-
-    def around(self, A: FloatArray) -> FloatArray:
-        """Return the same for A of all variables, shape (n, m)."""
-        scaled = A * self.scale[:, None]
-        half = scaled.T @ dtrmm(1.0, self.half.T, scaled, lower=1, trans_a=1)
-        return np.asarray(half + half.T)
-
-    def times(self, A: FloatArray) -> FloatArray:
-        """Return ``Sigma A`` for A of all variables, shape (n, m)."""
-        scaled = A * self.scale[:, None]
-        return np.asarray((self.half @ scaled + self.half.T @ scaled) * self.scale[:, None])
-
-    def columns(self, at: IntArray) -> FloatArray:
-        """Return the covariance of all variables with some, shape (n, k)."""
-        half = self.half[:, at] + self.half[at].T
-        return np.asarray(half * self.scale[:, None] * self.scale[at])
-
-    def loosened(self, at: IntArray, spread: FloatArray) -> "tuple[HalfCovariance, FloatArray]":
-        """Return the same where variables of unit prior have these standard deviations, (k,).
-
-        And a root of what that adds, shape (n, l): one column for each that is wider than one.
-        """
-        half, added = self.half, []
-        for variable, deviation in zip(at, spread, strict=True):
-            if deviation <= 1:
-                continue
-            column = HalfCovariance(self.scale, half).columns(np.array([variable]))[:, 0]
-            said = max(1 / column[variable] - 1, 0.0)
-            grown = 1 / (1 / deviation**2 + said)
-            column *= np.sqrt(grown - column[variable]) / column[variable]
-            white = column / self.scale
-            grown_by = np.triu(np.outer(white, white))
-            grown_by[np.diag_indices_from(grown_by)] *= 0.5
-            half = half + grown_by
-            added.append(column)
-        root = np.column_stack([np.empty((len(self), 0)), *added])
-        return HalfCovariance(self.scale, half), root
-
-    def blocks(self, at: IntArray, J: FloatArray, size: int) -> FloatArray:
-        """Return the blocks of ``J Sigma J^T`` about its diagonal, shape (m / size, size, size).
-
-        J is by some variables, shape (m, k).
-        """
-        scaled = J * self.scale[at]
-        half = scaled @ submatrix(self.half, at)
-        shape = (-1, size, len(at))
-        found = half.reshape(shape) @ scaled.reshape(shape).transpose(0, 2, 1)
-        return np.asarray(found + found.transpose(0, 2, 1))
-
-    def trace(self, at: IntArray, J: FloatArray) -> float:
-        """Return the trace of ``J Sigma J^T`` for J by some variables, shape (m, k)."""
-        return float(self.blocks(at, J, 1).sum())
+    shape = (-1, size, len(covariance))
+    return (J @ covariance).reshape(shape) @ J.reshape(shape).transpose(0, 2, 1)
 
 
-def leverage(every: HalfCovariance, rows: Rows, whitening: FloatArray) -> FloatArray:
+def leverage(every: FloatArray, rows: Rows, whitening: FloatArray) -> FloatArray:
     """Return the share of each reading's variance that a fit takes of its residual, shape (n,).
 
     Of the residual as it is: a white one mixes readings whose poses' errors have much in common,
@@ -172,7 +73,7 @@ def leverage(every: HalfCovariance, rows: Rows, whitening: FloatArray) -> FloatA
     Parameters
     ----------
     every
-        Covariance of all variables.
+        Covariance of all N variables, shape (N, N).
     rows
         White rows of n readings.
     whitening
@@ -181,7 +82,7 @@ def leverage(every: HalfCovariance, rows: Rows, whitening: FloatArray) -> FloatA
     size = whitening.shape[-1]
     # What made white, undone: a root of each block's covariance.
     root = np.linalg.solve(whitening.reshape(-1, size, size), np.eye(size))
-    taken = every.blocks(rows.columns, rows.jacobian, size)
+    taken = blocks(submatrix(every, rows.columns), rows.jacobian, size)
     # Products of matrices: einsum plans anew how to contract each of a thousand groups.
     fitted = ((root @ taken) * root).sum(axis=2)
     whole = (root**2).sum(axis=2)
@@ -199,7 +100,7 @@ class JointInformation:
     rows
         What it is made of beside the prior of the weights.
     every
-        Covariance of all variables, each in units of its sigma if all others were known.
+        Covariance of all variables, shape (n, n).
     step
         To the least cost, shape (n,).
     decrement
@@ -210,14 +111,14 @@ class JointInformation:
 
     columns: Mapping[int, slice]
     rows: Sequence[Rows]
-    every: HalfCovariance
+    every: FloatArray
     step: FloatArray
     decrement: float
     loose: FloatArray
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """Return the covariance of the k variables of some keys, in their order, shape (k, k)."""
-        return self.every.among(columns_at(self.columns, keys))
+        return submatrix(self.every, columns_at(self.columns, keys))
 
     def loosened(self, key: int, spread: FloatArray) -> "JointInformation":
         """Return the same where unit variables of a key have these standard deviations in truth.
@@ -226,8 +127,17 @@ class JointInformation:
         variable, the information beyond its prior's, stays as it is; its covariance with all others
         grows with its own.
         """
-        every, loose = self.every.loosened(columns_at(self.columns, [key]), spread)
-        return replace(self, every=every, loose=loose)
+        every, added = self.every, [self.loose]
+        for variable, deviation in zip(columns_at(self.columns, [key]), spread, strict=True):
+            if deviation <= 1:
+                continue
+            column = every[:, variable]
+            said = max(1 / column[variable] - 1, 0.0)
+            grown = 1 / (1 / deviation**2 + said)
+            column = column * (np.sqrt(grown - column[variable]) / column[variable])
+            every = every + np.outer(column, column)
+            added.append(column[:, None])
+        return replace(self, every=every, loose=np.hstack(added))
 
     def loose_among(self, sensors: tuple[int, ...]) -> FloatArray:
         """Return what ``among`` has beyond the system's covariance, shape (16 n, 16 n)."""
@@ -291,8 +201,8 @@ class JointInformation:
         """Trace of ``J Sigma J^T`` over the rows of each sensor."""
         traces: dict[int, float] = {}
         for rows in self.rows:
-            share = self.every.trace(rows.columns, rows.jacobian)
-            traces[rows.sensor] = traces.get(rows.sensor, 0.0) + share
+            taken = blocks(submatrix(self.every, rows.columns), rows.jacobian, 1)
+            traces[rows.sensor] = traces.get(rows.sensor, 0.0) + float(taken.sum())
         return traces
 
 
@@ -332,7 +242,9 @@ def joint_information(
     except LinAlgError:
         lower = root_by_qr(rows, weights, scale)
     step = scale * cho_solve((lower, True), scale * pull, check_finite=False)
-    every = HalfCovariance.from_factor(lower, scale)
+    every = inverse_of_factor(lower)
+    every *= scale
+    every *= scale[:, None]
     decrement = float(np.sqrt(max(pull @ step, 0.0)))
     return JointInformation(columns, rows, every, step, decrement, np.empty((count, 0)))
 

@@ -29,7 +29,6 @@ from l2m_gtsam.calibration.cluster_robust import (
     whitening_of,
 )
 from l2m_gtsam.calibration.half_difference import WhiteGroup
-from l2m_gtsam.calibration.joint_information import HalfCovariance
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 
@@ -103,7 +102,7 @@ class Walk:
         readings: Readings,
         groups: Sequence[WhiteGroup],
         H: IntArray,
-        covariance: HalfCovariance,
+        covariance: FloatArray,
     ) -> "Walk":
         """Return the walk of a sensor.
 
@@ -116,7 +115,7 @@ class Walk:
         H
             Where its offset stands among all n variables, shape (3,).
         covariance
-            Of all n variables.
+            Of all n variables, shape (n, n).
         """
         modes = TimeModes.over(readings, MODES)
         size = 1 / (np.pi * modes.frequency)
@@ -127,7 +126,7 @@ class Walk:
             pull[each.rows.columns] += each.rows.jacobian.T @ Z
             rows.append(Z)
         spread = float((size[:MODES] ** 2).sum())
-        return cls(tuple(rows), covariance.times(pull), spread)
+        return cls(tuple(rows), covariance @ pull, spread)
 
     def scores(
         self, groups: Sequence[WhiteGroup], labels: IntArray, influence: FloatArray, white: Gathered
@@ -160,7 +159,7 @@ def by_parts(
     readings: Readings,
     groups: Sequence[WhiteGroup],
     own: IntArray,
-    covariance: HalfCovariance,
+    covariance: FloatArray,
 ) -> ByParts:
     """Return what the scatter of parts of a drive says of a sensor.
 
@@ -175,9 +174,9 @@ def by_parts(
     own
         Where its sixteen parameters stand among all n variables, shape (16,).
     covariance
-        Of all n variables.
+        Of all n variables, shape (n, n).
     """
-    P, influence = covariance.among(own), covariance.columns(own)
+    P, influence = covariance[np.ix_(own, own)], covariance[:, own]
     rows = [each.rows for each in groups]
     walk = Walk.of(readings, groups, own[BLOCKS["H"]], covariance)
     found: dict[str, list[PartsRatio]] = {"t": [], "C": [], "H": []}

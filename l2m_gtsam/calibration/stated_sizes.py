@@ -13,6 +13,7 @@ from scipy.linalg import cholesky, solve_triangular
 from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import FACTOR, ErrorCause, StatedSize
+from l2m_gtsam.solve.linear_algebra import submatrix
 from l2m_gtsam.solve.noise import NOISE_RANGE
 from l2m_gtsam.solve.variance_components import WeightSystem
 
@@ -164,7 +165,7 @@ def size_of_shared(
     weights
         Their most likely values, shape (K,).
     """
-    system = without_prior(joint.every.among(at), prior, weights)
+    system = without_prior(submatrix(joint.every, at), prior, weights)
     found = system.components(np.ones((1, len(at))))
     as_stated = system.fit(np.ones(len(at))).likelihood
     return StatedSize(cause, float(np.sqrt(found.sizes[0])), found.gain - 2 * as_stated)

@@ -65,7 +65,7 @@ def variance_parts(
     own = np.concatenate([columns_at(joint.columns, keys_of(s)) for s in sensors])
     # What surveys' sensors are looser by in truth than in the system is theirs.
     loose = joint.loose[own]
-    influence = joint.every.columns(own) - joint.loose @ loose.T
+    influence = joint.every[:, own] - joint.loose @ loose.T
     variances: dict[ErrorCause, FloatArray] = {ErrorCause.SUITE: (loose**2).sum(axis=1)}
 
     def add(cause: ErrorCause, values: FloatArray) -> None:

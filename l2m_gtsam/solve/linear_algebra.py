@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from scipy.linalg import cholesky, eigh_tridiagonal
-from scipy.linalg.lapack import dgeqrf, dpstrf, dtrtri
+from scipy.linalg.lapack import dgeqrf, dpotri, dpstrf, dtrtri
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -174,6 +174,17 @@ def add_upper(matrix: FloatArray, at: IntArray, block: FloatArray) -> None:
             column = at[j]
             if column >= row:
                 matrix[row, column] += block[i, j]
+
+
+def inverse_of_factor(lower: FloatArray) -> FloatArray:
+    """Return the inverse of a matrix from its Cholesky factor, in C order, shape (n, n).
+
+    The factor has zeros above its diagonal. In Fortran order it is overwritten.
+    """
+    inverse, _ = dpotri(lower, lower=1, overwrite_c=1)  # above the diagonal zeros stay
+    whole = inverse.T
+    whole += np.triu(whole, 1).T
+    return np.asarray(whole)
 
 
 @njit(cache=True, nogil=True)

@@ -140,7 +140,7 @@ class ProcessInformation:
     def _moved(self, pull: FloatArray) -> FloatArray:
         """Return where pulls, shape (n, k), take all variables, in the system itself."""
         loose = self.joint.loose
-        return np.asarray(loose @ (loose.T @ pull) - self.joint.every.times(pull))
+        return np.asarray(loose @ (loose.T @ pull) - self.joint.every @ pull)
 
 
 def process_information(
@@ -189,7 +189,7 @@ def process_information(
         pull[at] -= Z.T @ np.concatenate([each.residual for each, _ in groups])
     # The residuals are those of the system itself, which holds the survey's sensors tighter.
     loose = joint.loose.T @ across
-    information = own - joint.every.around(across) + loose.T @ loose
+    information = own - across.T @ joint.every @ across + loose.T @ loose
     system = WeightSystem(0.5 * (information + information.T), pull)
     squares = sum(float(each.residual @ each.residual) for each in rows)
     return ProcessInformation(processes, columns, system, squares, joint, across)

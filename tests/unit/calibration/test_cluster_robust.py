@@ -17,7 +17,7 @@ from l2m_gtsam.calibration.cluster_robust import (
     scatters,
     unmodelled,
 )
-from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
+from l2m_gtsam.calibration.joint_information import Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.records.error_budget import EXPLAINED, Unmodelled
@@ -37,12 +37,9 @@ class Fitted:
     covariance: FloatArray
     error: FloatArray
 
-    @property
-    def half(self) -> HalfCovariance:
-        return HalfCovariance.of(self.covariance)
-
     def unmodelled(self) -> Excess:
-        return unmodelled(scatters(self.readings, self.rows, OWN, self.half), OWN, self.half, 1)
+        found = scatters(self.readings, self.rows, OWN, self.covariance)
+        return unmodelled(found, OWN, self.covariance, 1)
 
 
 def fitted(rng: np.random.Generator, lasting: float = 0.0) -> Fitted:
@@ -86,7 +83,7 @@ def test_expected_scores_are_those_of_many_fits() -> None:
     rng = np.random.default_rng(1)
     one = fitted(rng)
     labels = halved(one.readings.stamp_ns[:, None].astype(np.float64), 4)
-    scores = gathered(one.rows, labels, OWN, one.half).scores(one.half)
+    scores = gathered(one.rows, labels, OWN, one.covariance).scores(one.covariance)
     X = np.vstack([each.jacobian for each in one.rows])
     # e = (I - X P X^T) noise + prior's share; its covariance is I - X P X^T.
     left = np.eye(len(X)) - X @ one.covariance @ X.T
@@ -99,7 +96,7 @@ def test_expected_scores_are_those_of_many_fits() -> None:
 def test_scores_add_up_to_the_pull_of_the_priors() -> None:
     one = fitted(np.random.default_rng(2))
     labels = halved(one.readings.p_map_lidar, 4)
-    sums = gathered(one.rows, labels, OWN, one.half)
+    sums = gathered(one.rows, labels, OWN, one.covariance)
     size = np.abs(sums.found).sum(axis=0)
     # The shared errors are known to be zero, with unit variance.
     pull = -one.covariance[OWN, :SHARED] @ one.x[:SHARED]
@@ -167,8 +164,8 @@ def test_a_wider_covariance_lies_between_the_models_and_its_largest_multiple(
 def test_few_readings_tell_nothing() -> None:
     one = fitted(np.random.default_rng(5), lasting=5.0)
     few = [Rows(0, r.columns, r.jacobian[:3], r.residual[:3], r.readings[:1]) for r in one.rows]
-    assert not scatters(one.readings, few, OWN, one.half)
-    assert unmodelled((), OWN, one.half, 1).factors == EXPLAINED
+    assert not scatters(one.readings, few, OWN, one.covariance)
+    assert unmodelled((), OWN, one.covariance, 1).factors == EXPLAINED
 
 
 @given(

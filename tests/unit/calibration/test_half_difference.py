@@ -10,7 +10,7 @@ from l2m_gtsam.calibration.half_difference import (
     WhiteGroup,
     half_differences,
 )
-from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
+from l2m_gtsam.calibration.joint_information import Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 
 WEIGHTS, READINGS, SENSORS = 5, 60, 2
@@ -64,8 +64,7 @@ class Drive:
             rows = Rows(sensor, columns, J[:, columns], residual, np.arange(READINGS))
             groups.append(WhiteGroup(rows, self.W[sensor]))
         halved = {s: HalvedSensor(own(s)[:JUDGED], float(SENSOR)) for s in range(SENSORS)}
-        every = HalfCovariance.of(covariance)
-        return half_differences(groups, self.later, halved, every, np.empty((COUNT, 0)))
+        return half_differences(groups, self.later, halved, covariance, np.empty((COUNT, 0)))
 
     def apart(self) -> tuple[np.ndarray, np.ndarray]:
         """By a larger problem, in which sensors of either half are variables of their own."""

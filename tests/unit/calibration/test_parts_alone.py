@@ -6,7 +6,7 @@ from scipy.linalg import block_diag
 
 from l2m_gtsam.calibration.cluster_robust import VarianceRatio
 from l2m_gtsam.calibration.half_difference import WhiteGroup
-from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
+from l2m_gtsam.calibration.joint_information import Rows
 from l2m_gtsam.calibration.parts_alone import MODES, ByParts, Walk, by_parts, lasting, share_shown
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import FloatArray, Readings
@@ -50,8 +50,7 @@ def fit(X: FloatArray, wrong: FloatArray) -> tuple[FloatArray, ByParts]:
     x = covariance @ (X.T @ white)
     rows = Rows(0, OWN, X, X @ x - white, np.arange(READINGS))
     group = WhiteGroup(rows, np.broadcast_to(np.eye(3) / NOISE, (READINGS, 3, 3)))
-    half = HalfCovariance.of(covariance)
-    return x, by_parts(0, x[:15], readings_of(READINGS), [group], OWN, half)
+    return x, by_parts(0, x[:15], readings_of(READINGS), [group], OWN, covariance)
 
 
 def walk(rng: np.random.Generator) -> FloatArray:
@@ -95,7 +94,7 @@ def test_the_share_that_parts_show_is_that_of_many_walks() -> None:
     covariance: FloatArray = np.asarray(np.linalg.inv(X.T @ X), dtype=np.float64)
     rows = Rows(0, OWN, X, np.zeros(len(X)), np.arange(READINGS))
     group = WhiteGroup(rows, np.broadcast_to(np.eye(3) / NOISE, (READINGS, 3, 3)))
-    modes = Walk.of(readings_of(READINGS), [group], OWN[12:15], HalfCovariance.of(covariance))
+    modes = Walk.of(readings_of(READINGS), [group], OWN[12:15], covariance)
     drawn = rng.standard_normal((4000, 3 * MODES)) @ modes.rows[0].T * NOISE
     steps = drawn.reshape(4000, READINGS, 3)
     # It is a walk: its variance is that of Brownian motion about its mean, but for fast modes.

@@ -10,6 +10,7 @@ from l2m_gtsam.solve.linear_algebra import (
     covariance_root,
     eigenpairs,
     information_root,
+    inverse_of_factor,
     leading_eigenvectors,
     lower_information_root,
     right_divided,
@@ -150,3 +151,15 @@ def test_an_invariant_space_ends_the_iteration() -> None:
     values, vectors = eigenpairs(lambda v: matrix @ v, np.ones(20), 20)
     np.testing.assert_allclose(values, [1, 2, 3, 4, 5], atol=1e-9)
     assert vectors.shape == (20, 5)
+
+
+@given(st.integers(1, 30), st.integers(0, 10**6))
+def test_the_inverse_of_a_factor_is_that_of_its_matrix(size: int, seed: int) -> None:
+    root = np.random.default_rng(seed).standard_normal((size, size)) + 3 * np.eye(size)
+    matrix = root @ root.T + np.eye(size)
+    whole = np.linalg.inv(matrix)
+    found = inverse_of_factor(np.asfortranarray(np.linalg.cholesky(matrix)))
+    # Rounding, times the condition of a matrix whose diagonal stands out.
+    np.testing.assert_allclose(found, whole, rtol=1e-7, atol=1e-9 * np.abs(whole).max())
+    np.testing.assert_array_equal(found, found.T)
+    assert found.flags.c_contiguous
