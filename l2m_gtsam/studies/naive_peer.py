@@ -66,7 +66,7 @@ class NaiveMap:
 def naive_map(
     points: FloatArray, field: FloatArray, path: FloatArray, options: NaiveOptions
 ) -> NaiveMap:
-    """Return the map around a drive; good for all drives on the same route.
+    """Return the map around a drive; other drives on its route are little farther from it.
 
     Parameters
     ----------

@@ -102,23 +102,25 @@ class SurveyedWarehouse:
     maps
         Of the survey, by kind.
     naive
-        What the naive peer makes of the survey on the paths that it was asked for.
+        What the naive peer makes of the survey, by the path that it was asked for.
     """
 
     site: SurveyedSite
     maps: dict[str, QueryableMap]
-    naive: dict[RouteShape, NaiveMap] = field(default_factory=dict)
+    naive: dict[int, NaiveMap] = field(default_factory=dict)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The naive peer's maps are fifty times as large as all others together.
         return SurveyedWarehouse, (self.site, self.maps)
 
-    def naive_map(self, path: RouteShape, drive: SiteDrive, options: NaiveOptions) -> NaiveMap:
-        """Return the naive peer's map around a path, made from its first drive."""
-        if path not in self.naive:
-            survey, line = self.site.survey, drive.readings.p_map_lidar
-            self.naive[path] = naive_map(survey.points, survey.field, line, options)
-        return self.naive[path]
+    def naive_map(self, options: Table1Options, row: int) -> NaiveMap:
+        """Return the naive peer's map around a path."""
+        if row not in self.naive:
+            # Always the same drive: a cell must not depend on those before it in its process.
+            survey, first = self.site.survey, drive_of(options, self.site, 0, row, 0)
+            line = first.readings.p_map_lidar
+            self.naive[row] = naive_map(survey.points, survey.field, line, options.naive)
+        return self.naive[row]
 
 
 @dataclass(frozen=True)
@@ -186,8 +188,7 @@ def compute(
         Which noise, which path, which of their drives.
     """
     noise, path = options.noises[level], options.paths[row]
-    rng = np.random.default_rng([options.seed, level, row, number, DRIVE])
-    drive = random_drive(place.site, drive_options(options, noise, path), rng)
+    drive = drive_of(options, place.site, level, row, number)
     t_start = random_starts(options, drive.sensor.t_lidar_mag, [level, row, number])
     field_map = place.maps[HARMONIC]
     found = one_key(drive.readings, field_map, t_start, options.search, options.solve)
@@ -195,7 +196,7 @@ def compute(
     if number < options.others:
         few = t_start[: options.other_starts]
         ends += other_ends(drive, place, few, options)
-        peer_map = place.naive_map(path, drive, options.naive)
+        peer_map = place.naive_map(options, row)
         solve = partial(naive_peer, drive.readings, peer_map, options.naive)
         ends.append(ends_of(NAIVE, THINNED, drive, from_each(solve, few)))
     if number < options.magyc:
@@ -233,6 +234,15 @@ def drive_bound(
     """Return the root of the bound's trace over t, C and H, shape (3,)."""
     variance = np.diagonal(cramer_rao(drive.readings, field_map, drive.sensor, noise, options))
     return np.array([np.sqrt(variance[block].sum()) for block in BLOCKS])
+
+
+def drive_of(
+    options: Table1Options, site: SurveyedSite, level: int, row: int, number: int
+) -> SiteDrive:
+    """Return a drive; see ``compute``."""
+    rng = np.random.default_rng([options.seed, level, row, number, DRIVE])
+    chosen = drive_options(options, options.noises[level], options.paths[row])
+    return random_drive(site, chosen, rng)
 
 
 def drive_options(options: Table1Options, noise: float, path: RouteShape) -> SiteOptions:
