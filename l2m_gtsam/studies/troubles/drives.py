@@ -48,7 +48,7 @@ def troubled_drive(
             change[rows] += bent_scale
             truth[index] = linear_over(truth[index], readings.field[rows], bent_scale)
         if trouble.has(Trouble.JUMP):
-            jump, before = jumped(options, seed, index, len(seconds))
+            jump, before = jumped(options, seed, index, drive)
             change[rows] += np.where(before[:, None], 0.0, jump)
             truth[index] = with_offset(truth[index], jump)
         moment = np.random.default_rng([seed, 13, index]).integers(len(walked))
@@ -112,13 +112,16 @@ def steered(options: TroublesOptions, readings: Readings, rng: np.random.Generat
 
 
 def jumped(
-    options: TroublesOptions, seed: int, index: int, count: int
+    options: TroublesOptions, seed: int, index: int, drive: CalibrationDrive
 ) -> tuple[FloatArray, BoolArray]:
     """Return by how much H of a sensor jumps, uT, shape (3,), and which readings are before."""
+    first, last = drive.trajectory.stamp_ns[[0, -1]]
     at = np.random.default_rng([seed, 14]).uniform(*options.jump_at)
     direction = np.random.default_rng([seed, 15, index]).standard_normal(3)
     jump = options.jump_ut * direction / np.linalg.norm(direction)
-    return jump, np.arange(count) < at * count
+    # A share of the drive, not of the readings: sensors do not read where structures are near.
+    stamps = drive.readings.stamp_ns[drive.readings.rows_of(index)]
+    return jump, stamps < first + at * (last - first)
 
 
 def with_offset(sensor: KnownSensor, change: FloatArray) -> KnownSensor:

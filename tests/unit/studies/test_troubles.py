@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +17,19 @@ from l2m_gtsam.studies.troubles.drives import (
     noise_that_lasts,
     not_linear,
     pink,
+    troubled_drive,
     walk,
 )
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
-from l2m_gtsam.studies.troubles.study import TROUBLES, CellName, inside, kind, row_of
-from l2m_gtsam.studies.troubles.surveys import known_suite, place_of, survey_of
+from l2m_gtsam.studies.troubles.study import (
+    TROUBLES,
+    CellName,
+    TroublesSummary,
+    inside,
+    kind,
+    row_of,
+)
+from l2m_gtsam.studies.troubles.surveys import TroubledPlace, known_suite, place_of, survey_of
 
 OPTIONS = TroublesOptions(surveys=2, drives=1)
 
@@ -70,6 +79,22 @@ def test_of_a_scale_that_is_not_linear_the_nearest_linear_one_is_true() -> None:
     np.testing.assert_allclose(left.mean(axis=0), 0, atol=1e-9)
     np.testing.assert_allclose(b_lidar.T @ left, 0, atol=1e-6)
     assert np.square(left).sum() < 0.5 * np.square(change).sum()
+
+
+@pytest.mark.parametrize("seed", [700, 702])
+def test_the_offsets_of_all_sensors_jump_at_one_moment(seed: int) -> None:
+    unmapped: Any = None
+    place = TroubledPlace(place_of(World.HALL, seed), unmapped)
+    clean, jumped = (
+        troubled_drive(OPTIONS, place, trouble, 0)[0].series
+        for trouble in (Trouble.CLEAN, Trouble.JUMP)
+    )
+    last_before, first_after = [], []
+    for one, other in zip(clean, jumped, strict=True):
+        after = (one.field != other.field).any(axis=1)
+        last_before.append(one.stamp_ns[~after].max())
+        first_after.append(one.stamp_ns[after].min())
+    assert max(last_before) < min(first_after)
 
 
 def test_a_bent_frame_moves_places_and_turns_them_by_half_its_curl() -> None:
@@ -163,6 +188,18 @@ def test_conditions_are_counted() -> None:
     page = TROUBLES.page(summary)
     assert "| suite-stated | 2, 2, 2 |" in page
     assert set(TROUBLES.figures(summary)) == {"troubles"}
+
+
+@pytest.mark.parametrize(
+    ("world", "places", "others"),
+    [("hall", "2 halls of", "corridor"), ("office", "2 office", "hall")],
+)
+def test_the_page_tells_of_the_places_that_there_are(world: str, places: str, others: str) -> None:
+    options = TroublesOptions(surveys=2, worlds=(World(world),))
+    row = row_of(World(world), Trouble.CLEAN, [judged(Level.PASS, 10.0)])
+    page = TROUBLES.page(TroublesSummary(options, (row,), lasting=True))
+    assert page.startswith(places)
+    assert others not in page.lower()
 
 
 def test_conditions_of_one_map_follow_each_other() -> None:
