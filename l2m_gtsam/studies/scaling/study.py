@@ -112,7 +112,7 @@ class ScalingStudy(Study[ScalingOptions, ScalingCell, ScalingTable]):
             case Quantity.SENSORS as grown:
                 numeric = count <= options.numeric_sensors
                 work = shared.first(count).thinned(options.each)
-                measured = measured_solves(options, grown, count, work, numeric)
+                measured = measured_solves(options, grown, len(work.t_true), work, numeric)
             case Quantity.SURVEY:
                 measured = (measured_map(options, TimedTask[task[0].upper()], count, shared),)
             case Quantity.WORKERS:
