@@ -107,7 +107,8 @@ def is_right(
     that it does not fit, and nothing of steel.
     """
     if change is TrueCause.ELSEWHERE:
-        return not found.sources and verdict.reasons[0].text.startswith(WRONG_MAP)
+        misfits = any(each.text.startswith(WRONG_MAP) for each in verdict.reasons)
+        return misfits and not found.sources
     off = away(drive, found)
     if (off is not None and off > NEAR_M) or (off is None) != (drive.steel is None):
         return False

@@ -77,6 +77,7 @@ NONE: tuple[set[CalibrationPart], ...] = (set(), set())
         (TrueCause.BOTH, said({IRON}, {IRON}), False),
         (TrueCause.SENSOR, said(set(), {TURN}), True),
         (TrueCause.SENSOR, said({TURN}, {TURN}), False),
+        (TrueCause.ELSEWHERE, said(*NONE), False),
     ],
 )
 def test_right_is_what_changed_and_nothing_else(change: TrueCause, found: Any, right: bool) -> None:
