@@ -126,8 +126,8 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
     def keys(self, options: SlamStudyOptions) -> tuple[str, ...]:
         """Return one cell for each recording, drift, form and seed."""
         return tuple(
-            f"{site}-{kind}-{form}-{options.seed + number}"
-            for site in options.recordings
+            f"{carrier}-{run}-{kind}-{form}-{options.seed + number}"
+            for carrier, run in (parts_of(each, READERS) for each in options.recordings)
             for kind in DriftKind
             for form in Form
             for number in range(options.seeds)

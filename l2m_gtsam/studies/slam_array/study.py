@@ -99,8 +99,8 @@ class SlamArrayStudy(Study[SlamArrayOptions, SlamArrayCell, SlamArraySummary]):
     def keys(self, options: SlamArrayOptions) -> tuple[str, ...]:
         """Return one cell for each recording, drift and seed."""
         return tuple(
-            f"{site}-{drift}-{options.seed + number}"
-            for site in options.recordings
+            f"{place}-{run}-{drift}-{options.seed + number}"
+            for place, run in (parts_of(each, PLACES) for each in options.recordings)
             for drift in Drift
             for number in range(options.seeds)
         )

@@ -93,10 +93,11 @@ def test_a_run_of_the_map_is_no_drive_through_it(tmp_path: Path, shared_data: Pa
 
 
 @pytest.mark.parametrize("study", [SLAM, SLAM_ARRAY])
-@pytest.mark.parametrize("site", ["submarine-1", "robot", "robot-one"])
+@pytest.mark.parametrize("site", ["submarine-1", "robot", "robot-one", "robot-1-2"])
 def test_a_recording_that_is_none_is_named(study: Study[Any, Any, Any], site: str) -> None:
+    """As it is written, and before anything is computed."""
     with pytest.raises(ConfigError, match=f"'{site}' is none; they are named like"):
-        study.prepare(study.options(recordings=(site,)), site)
+        study.keys(study.options(recordings=("robot-1", site)))
 
 
 def test_a_pass_that_there_is_not_is_named(shared_data: Path) -> None:
