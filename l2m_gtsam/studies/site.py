@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.calibration.view import QueryableMap, for_solvers
@@ -47,6 +48,15 @@ class SiteOptions(Options):
     """Which readings of a drive enter."""
     radius: float = Field(default=0.6, gt=0)
     """Sensors sit within so many metres of the lidar, at heights that the survey passed."""
+
+    @model_validator(mode="after")
+    def _heights_within_reach(self) -> Self:
+        heights = self.scenario.suite.heights
+        if min(heights) >= self.radius or max(heights) <= -self.radius:
+            raise ValueError(
+                f"scenario.suite.heights: none is less than the `radius` of {self.radius:g} m away"
+            )
+        return self
 
 
 @dataclass(frozen=True)
