@@ -166,3 +166,9 @@ def mean_of(values: Sequence[float | None]) -> float | None:
     """Return the mean of what is stated; None of nothing."""
     stated = [each for each in values if each is not None]
     return float(np.mean(stated)) if stated else None
+
+
+def rms_of(values: Sequence[float | None]) -> float | None:
+    """Return the root mean square of what is stated; None of nothing."""
+    square = mean_of([None if each is None else each**2 for each in values])
+    return None if square is None else square**0.5

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from l2m_gtsam.studies.changes.cells import NEAR_M, ChangesCell, TrueChange, cell_of, unchanged_cell
 from l2m_gtsam.studies.changes.loads import ChangesStudyOptions, LoadedHall, loaded_hall
-from l2m_gtsam.studies.statistics import Share, in_percent
+from l2m_gtsam.studies.statistics import Share, in_percent, rms_of
 from l2m_gtsam.studies.study import Study
 
 # Edges of the classes that changes are counted in.
@@ -49,7 +49,7 @@ class ChangesSummary:
     false_with, false_without, hours_with, hours_without
         False alarms on drives with changes and without, and how long each of these took together.
     clean_m, changed_m
-        Root mean squares of the error of t.
+        Root mean squares of the error of t; None where no sensor has a result.
     undetermined
         Sensors without a result on a drive with changes.
     clean_held, changed_held
@@ -65,8 +65,8 @@ class ChangesSummary:
     false_without: int
     hours_with: float
     hours_without: float
-    clean_m: float
-    changed_m: float
+    clean_m: float | None
+    changed_m: float | None
     undetermined: int
     clean_held: Share
     changed_held: Share
@@ -129,8 +129,8 @@ class ChangesStudy(Study[ChangesStudyOptions, ChangesCell, ChangesSummary]):
             false_without=sum(cell.false_without for cell in every),
             hours_with=sum(cell.hours_with for cell in every),
             hours_without=sum(cell.hours_without for cell in every),
-            clean_m=rms([each.clean_m for each in sensors]),
-            changed_m=rms([each.changed_m for each in sensors]),
+            clean_m=rms_of([each.clean_m for each in sensors]),
+            changed_m=rms_of([each.changed_m for each in sensors]),
             undetermined=sum(each.changed_m is None for each in sensors),
             clean_held=Share(sum(each.clean_held for each in sensors), len(sensors)),
             changed_held=Share(sum(each.changed_held for each in sensors), len(sensors)),
@@ -183,11 +183,6 @@ def found_of(changes: list[TrueChange]) -> ShareFound | None:
         float(np.median(away)) if away else None,
         float(np.median(off)) if off else None,
     )
-
-
-def rms(values: list[float | None]) -> float:
-    """Return the root mean square of what is known."""
-    return float(np.sqrt(np.mean(np.square([each for each in values if each is not None]))))
 
 
 CHANGES = ChangesStudy()

@@ -9,7 +9,14 @@ from matplotlib.figure import Figure
 from scipy.stats import f
 
 from l2m_gtsam.records.verdict import Level
-from l2m_gtsam.studies.statistics import LEVEL, Share, ellipsoid_coverage, in_percent, mean_of
+from l2m_gtsam.studies.statistics import (
+    LEVEL,
+    Share,
+    ellipsoid_coverage,
+    in_percent,
+    mean_of,
+    rms_of,
+)
 from l2m_gtsam.studies.study import Study
 from l2m_gtsam.studies.troubles.cells import Checked, JudgedSensor, TroublesCell, cell_of
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
@@ -205,19 +212,14 @@ def row_of(world: World, trouble: Trouble, found: list[JudgedSensor]) -> Trouble
         alone_t=by_check(known, "t", DOF_T),
         alone_C=by_check(known, "C", DOF_C),
         alone_H=by_check(known, "H", DOF_H),
-        error_m=rms([each.error_m for each in known]),
-        sigma_m=rms([each.sigma_m for each in known]),
+        error_m=rms_of([each.error_m for each in known]),
+        sigma_m=rms_of([each.sigma_m for each in known]),
     )
 
 
 def count(found: list[JudgedSensor], level: Level) -> int:
     """Return how many were judged so."""
     return sum(each.level == level.value for each in found)
-
-
-def rms(values: list[Any]) -> float | None:
-    """Return the root of the mean square, if there is one."""
-    return float(np.sqrt(np.mean(np.square(values)))) if values else None
 
 
 def within(distances: list[Any], dof: int) -> Share | None:

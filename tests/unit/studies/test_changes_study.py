@@ -106,3 +106,12 @@ def test_the_page_counts_what_is_found() -> None:
     assert "| 2 in 1.0 hours |" in page
     assert "| 3.0 mm; 4.0 mm |" in page
     assert set(CHANGES.figures(summary)) == {"changes"}
+
+
+def test_without_a_result_no_error_is_stated() -> None:
+    none = SensorErrors(0.003, None, True, False)
+    cell = ChangesCell(1, (), 0, 0, 0.5, 0.5, (none,), 0.0)
+    summary = CHANGES.summarise(ChangesStudyOptions(), {"a": cell})
+    assert summary.clean_m == pytest.approx(0.003)
+    assert summary.changed_m is None
+    assert "| 3.0 mm; none |" in CHANGES.page(summary)
