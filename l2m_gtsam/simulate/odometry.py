@@ -8,6 +8,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
+from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.sensors import NoiseOptions
 
@@ -132,7 +133,7 @@ def _accumulated(start: FloatArray, R: FloatArray, p: FloatArray, Q: FloatArray)
     All steps' errors are moved to the first pose, where they add up, and the sums to each pose.
     """
     # A right perturbation d at pose T is Ad(T) d at the first pose: Exp(Ad d) T = T Exp(d).
-    there, back = _adjoints(R, p - p[0]), _adjoints(*_inverse(R, p - p[0]))
+    there, back = carried_back(*_inverse(R, p - p[0])), carried_back(R, p - p[0])
     fresh = np.concatenate([start[None], Q])
     summed = np.cumsum(there @ fresh @ there.swapaxes(1, 2), axis=0)
     P = back @ summed @ back.swapaxes(1, 2)
@@ -142,11 +143,3 @@ def _accumulated(start: FloatArray, R: FloatArray, p: FloatArray, Q: FloatArray)
 def _inverse(R: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
     back = R.swapaxes(1, 2)
     return back, -np.einsum("nij,nj->ni", back, p)
-
-
-def _adjoints(R: FloatArray, p: FloatArray) -> FloatArray:
-    """Return what takes small motions of a body to those of its frame, shape (N, 6, 6)."""
-    found = np.zeros((len(p), 6, 6))
-    found[:, :3, :3] = found[:, 3:, 3:] = R
-    found[:, 3:, :3] = np.cross(p[:, None], R.swapaxes(1, 2)).swapaxes(1, 2)
-    return found

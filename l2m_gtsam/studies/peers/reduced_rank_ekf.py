@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_factors import skew
 from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.geometry import from_ros
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
 from l2m_gtsam.options import Options
 
@@ -88,13 +89,6 @@ def reduced_rank_ekf(
         R.append(Rotation.from_rotvec(change[3:POSE]).as_matrix() @ axes)
         covariance.append(P[:POSE, :POSE])
     rotations = np.stack(R)
-    return replace(
-        odometry, R=rotations, p=np.stack(p), covariance=in_body(np.stack(covariance), rotations)
-    )
-
-
-def in_body(covariance: FloatArray, R: FloatArray) -> FloatArray:
-    """Return covariances (N, 6, 6) of (p, rotation) along world axes as right perturbations."""
-    turn = np.zeros((len(R), POSE, POSE))
-    turn[:, :3, 3:] = turn[:, 3:, :3] = R.transpose(0, 2, 1)
-    return np.asarray(turn @ covariance @ turn.transpose(0, 2, 1))
+    # Of p and rotation along the axes of the world, as in ROS.
+    stated = from_ros(np.stack(covariance), rotations)
+    return replace(odometry, R=rotations, p=np.stack(p), covariance=stated)
