@@ -4,21 +4,8 @@ import runpy
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # benchmarks and tests are no part of the installed package
 
-MODULES = (
-    "map_queries",
-    "harmonic_build",
-    "compiled_map",
-    "global_start",
-    "one_key",
-    "map_uncertainty",
-    "last_stage",
-    "error_budget",
-    "online_localisation",
-    "online_exploring",
-    "slam_engine",
-)
-
-for name in MODULES:
-    runpy.run_module(f"benchmarks.{name}", run_name="__main__")
+for path in sorted((ROOT / "benchmarks").glob("*.py")):
+    runpy.run_module(f"benchmarks.{path.stem}", run_name="__main__")

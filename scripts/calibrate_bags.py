@@ -1,9 +1,6 @@
 """Calibrate a folder or a manifest of bags: the same as ``l2m batch``, with its options."""
 
 import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from l2m_gtsam.cli.app import main
 

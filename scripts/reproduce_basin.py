@@ -1,9 +1,6 @@
 """Reproduce the paper's success rates: the same as ``l2m study basin``, with its options."""
 
 import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from l2m_gtsam.cli.app import main
 
