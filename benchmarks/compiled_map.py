@@ -13,13 +13,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.dipole_hall import Survey
 from benchmarks.map_queries import survey, warehouse, within
 from benchmarks.timing import seconds
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.maps.sliding_gp import SlidingGP
+from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.simulate import hall_drives
 from l2m_gtsam.simulate.steel_hall import STRONG, steel_hall
 
@@ -36,7 +36,7 @@ class Maps:
     sliding: SlidingGP
 
     @classmethod
-    def of(cls, data: Survey, cloud: FloatArray | None = None) -> "Maps":
+    def of(cls, data: TrainingSet, cloud: FloatArray | None = None) -> "Maps":
         exact = HarmonicMap.fit(data.points, data.field, cloud=cloud)
         return cls(exact, exact.compile(), SlidingGP.fit(data.points, data.field))
 
@@ -47,8 +47,7 @@ def open_floor() -> Maps:
 
 def hall_with_posts() -> Maps:
     hall = steel_hall(3, STRONG)
-    data = hall_drives.survey(hall, 3)
-    return Maps.of(Survey(data.points, data.field), hall.cloud())
+    return Maps.of(hall_drives.survey(hall, 3), hall.cloud())
 
 
 def places(exact: HarmonicMap, count: int) -> FloatArray:

@@ -1,24 +1,17 @@
 """A hall of dipoles that several benchmarks drive through: its survey, its map and its sensors."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.data import KnownSensor
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
+from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from tests.worlds.exact import DipoleWorld
 
 NOISE = 0.1  # uT, of the survey and of the sensors
-
-
-@dataclass(frozen=True)
-class Survey:
-    """Readings of a map survey, positions in metres and fields in uT, shape (N, 3)."""
-
-    points: FloatArray
-    field: FloatArray
 
 
 def hall(seed: int) -> DipoleWorld:
@@ -29,12 +22,12 @@ def hall(seed: int) -> DipoleWorld:
     return DipoleWorld(np.array([22.0, 3.0, -38.0]), positions, rng.normal(0, 120, (60, 3)))
 
 
-def survey(world: DipoleWorld, count: int) -> Survey:
+def survey(world: DipoleWorld, count: int) -> TrainingSet:
     """Return readings in the volume that the drives of the benchmark pass."""
     rng = np.random.default_rng(0)
     points = rng.uniform([-5.5, -5.5, -0.6], [5.5, 5.5, 1.6], (count, 3))
     field, _ = world.field_and_gradient(points)
-    return Survey(points, field + rng.normal(0, NOISE, field.shape))
+    return checked_readings(points, field + rng.normal(0, NOISE, field.shape))
 
 
 def compiled_map(world: DipoleWorld) -> CompiledMap:

@@ -18,13 +18,12 @@ from rich.table import Table
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-from benchmarks.dipole_hall import Survey
 from benchmarks.timing import seconds
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.hyperparameters import KernelHyperparameters
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
-from l2m_gtsam.maps.training import ThinningOptions
+from l2m_gtsam.maps.training import ThinningOptions, TrainingSet, checked_readings
 from tests.worlds.exact import DipoleWorld
 
 SIZE = np.array([45.0, 35.0])  # metres
@@ -33,10 +32,9 @@ PEER_READINGS = 2_000
 NOISE = 0.1  # uT
 
 
-def within(data: Survey, half: float) -> Survey:
+def within(data: TrainingSet, half: float) -> TrainingSet:
     """Return the part in a square of this half-width about the middle."""
-    keep = np.abs(data.points[:, :2] - SIZE / 2).max(axis=1) < half
-    return Survey(data.points[keep], data.field[keep])
+    return data[np.flatnonzero(np.abs(data.points[:, :2] - SIZE / 2).max(axis=1) < half)]
 
 
 def warehouse() -> DipoleWorld:
@@ -48,7 +46,7 @@ def warehouse() -> DipoleWorld:
     return DipoleWorld(np.array([22.0, 3.0, -38.0]), positions, rng.normal(0, 25, (count, 3)))
 
 
-def survey(world: DipoleWorld) -> Survey:
+def survey(world: DipoleWorld) -> TrainingSet:
     """Return what nine sensors read on parallel lanes."""
     rng = np.random.default_rng(1)
     lanes = np.arange(0.5, SIZE[1], 1.5)[:, None] + np.array([-0.5, 0.0, 0.5])
@@ -59,7 +57,7 @@ def survey(world: DipoleWorld) -> Survey:
     )
     parts = np.array_split(points, len(points) // 500)  # 500 points times 630 dipoles at once
     field = np.concatenate([world.field_and_gradient(part)[0] for part in parts])
-    return Survey(points, field + rng.normal(0, NOISE, field.shape))
+    return checked_readings(points, field + rng.normal(0, NOISE, field.shape))
 
 
 def scattered(count: int, half: FloatArray) -> FloatArray:
@@ -70,7 +68,7 @@ def scattered(count: int, half: FloatArray) -> FloatArray:
     return np.asarray(middle + offset)
 
 
-def whole_map(data: Survey, console: Console) -> KernelHyperparameters:
+def whole_map(data: TrainingSet, console: Console) -> KernelHyperparameters:
     """Print what the map of the whole warehouse costs."""
     learnt = SlidingGP.fit(data.points, data.field)
     found = learnt.trained.hyperparameters
@@ -117,7 +115,7 @@ def peer_gradient(peer: GaussianProcessRegressor, points: FloatArray) -> FloatAr
     return np.stack(slopes, axis=-1)
 
 
-def against_the_peer(data: Survey, found: KernelHyperparameters) -> Table:
+def against_the_peer(data: TrainingSet, found: KernelHyperparameters) -> Table:
     """Return times of both on the same part of the survey, and how far they differ."""
     half = float(np.sqrt(PEER_READINGS / READINGS * SIZE.prod()) / 2)
     part = within(data, half)

@@ -11,7 +11,6 @@ from functools import partial
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from scipy.spatial.transform import Rotation
 
 from benchmarks.dipole_hall import NOISE, compiled_map, hall
 from benchmarks.memory import peak_mib
@@ -21,6 +20,7 @@ from l2m_gtsam.slam.online.follower import SECTION, Follower
 from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
+from tests.drives.slam import ahead
 from tests.worlds.exact import random_sensors
 
 SENSORS, RATE_HZ, SPEED = 12, 10, 0.8
@@ -56,10 +56,7 @@ def laps(count: int) -> Trajectory:
     wide, deep = 3.6 + 0.4 * np.sin(0.37 * angle + 0.3), 2.5 + 0.4 * np.sin(0.71 * angle + 1.0)
     height = 0.5 + 0.03 * np.sin(1.3 * at)
     p = np.column_stack([wide * np.cos(angle), deep * np.sin(angle), height])
-    v = np.gradient(p, at, axis=0)
-    turns = [np.arctan2(v[:, 1], v[:, 0]), 0.02 * np.sin(0.9 * at), 0.02 * np.cos(1.1 * at)]
-    R = Rotation.from_euler("ZYX", np.column_stack(turns)).as_matrix()
-    return Trajectory((1e9 * at).astype(np.int64), R, p, "map", "lidar")
+    return ahead(at, p)
 
 
 def followed(drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: int = SECTION) -> Run:

@@ -1,6 +1,7 @@
 """How long work takes."""
 
 import time
+import timeit
 from collections.abc import Callable
 
 
@@ -8,9 +9,4 @@ def seconds(
     work: Callable[[], object], repeats: int = 3, clock: Callable[[], float] = time.perf_counter
 ) -> float:
     """Return the shortest time of several runs; with ``process_time`` that of the processor."""
-    times = []
-    for _ in range(repeats):
-        start = clock()
-        work()
-        times.append(clock() - start)
-    return min(times)
+    return min(timeit.repeat(work, timer=clock, repeat=repeats, number=1))

@@ -18,6 +18,7 @@ from l2m_gtsam.data import (
     SourceFile,
     Trajectory,
 )
+from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.simulate.steel_hall import HALF_AREA, SteelHall
 
 CLEARANCE_M = 0.4  # of every reading to posts and racks, horizontally
@@ -25,22 +26,6 @@ BODY_M = 0.55  # of the vehicle's middle
 LANE_M = 0.4  # from lane to lane of a survey
 LIDAR_M = 0.7  # height of the lidar over the floor
 STEP_NS = 50_000_000
-
-
-@dataclass(frozen=True)
-class HallSurvey:
-    """Readings of an ideal magnetometer in the map frame.
-
-    Attributes
-    ----------
-    points
-        Places in metres, shape (N, 3).
-    field
-        Readings in uT, shape (N, 3).
-    """
-
-    points: FloatArray
-    field: FloatArray
 
 
 @dataclass(frozen=True)
@@ -133,8 +118,8 @@ def survey(
     heights: tuple[float, ...] = (0.4, 0.7, 1.0),
     noise: float = 0.2,
     count: int = 1500,
-) -> HallSurvey:
-    """Return a survey in lanes over the whole area, along x and along y by turns.
+) -> TrainingSet:
+    """Return what a sensor reads in lanes over the whole area, along x and along y by turns.
 
     Lanes bend around structures. The sensor follows the uneven floor. Slightly
     fewer than ``count`` readings come about where two structures leave no room.
@@ -145,7 +130,7 @@ def survey(
     points = np.concatenate(passes)
     points = points[hall.free(points, CLEARANCE_M)]
     field = hall.world.field(points) + noise * rng.standard_normal(points.shape)
-    return HallSurvey(points, field)
+    return checked_readings(points, field)
 
 
 def calibration_drive(

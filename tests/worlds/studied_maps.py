@@ -10,7 +10,8 @@ import numpy as np
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.field_map import MapSummary
-from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, HallSurvey, survey
+from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, survey
 from l2m_gtsam.simulate.steel_hall import (
     HALF_AREA,
     MILD,
@@ -60,7 +61,7 @@ class Scene:
         The truth.
     """
 
-    survey: HallSurvey
+    survey: TrainingSet
     cloud: FloatArray
     hall: SteelHall
 

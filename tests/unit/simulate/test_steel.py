@@ -6,7 +6,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, HallSurvey, calibration_drive, survey
+from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import (
     EARTH,
     HALF_AREA,
@@ -34,7 +35,7 @@ def hall(seed: int) -> SteelHall:
 
 
 @pytest.fixture(scope="module")
-def surveyed(hall: SteelHall, seed: int) -> HallSurvey:
+def surveyed(hall: SteelHall, seed: int) -> TrainingSet:
     return survey(hall, seed)
 
 
@@ -99,7 +100,7 @@ def test_all_steel_is_where_it_belongs(hall: SteelHall) -> None:
     assert (out_of_bodies(hall, np.column_stack([timber, np.full(5, 0.5)])) > 0.4).all()
 
 
-def test_magnitudes_are_those_of_a_hall(hall: SteelHall, surveyed: HallSurvey, seed: int) -> None:
+def test_magnitudes_are_those_of_a_hall(hall: SteelHall, surveyed: TrainingSet, seed: int) -> None:
     """A few uT of mild steel, some tens around strong posts (design of the studies)."""
     mild = held_out(hall, seed, SPAN).field - EARTH
     strong_hall = steel_hall(seed, STRONG)
@@ -150,7 +151,7 @@ def test_a_survey_covers_the_free_floor(
     assert np.mean(hall.distance(s.points) < 0.8) > 0.3
 
 
-def test_survey_noise_is_as_stated(hall: SteelHall, surveyed: HallSurvey) -> None:
+def test_survey_noise_is_as_stated(hall: SteelHall, surveyed: TrainingSet) -> None:
     noise = surveyed.field - hall.world.field(surveyed.points)
     # 4,500 draws: the standard deviation is known to 1.1 %, four of its errors are allowed.
     assert noise.std() == pytest.approx(0.2, rel=0.045)
