@@ -10,7 +10,7 @@ from l2m_gtsam.calibration.forecast import stated_at
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.optimise import Optimizer, optimise
 from l2m_gtsam.calibration.view import QueryableMap, StandIns, observe
-from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings
+from l2m_gtsam.data import Distortion, FloatArray, Readings
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import Uncertainty
@@ -25,7 +25,7 @@ from l2m_gtsam.solve.noise import reading_covariance
 
 UNKNOWNS = 15  # of a sensor: t, C and H
 PUBLISHED = ClosedFormOptions(weighting=Weighting.PAPER)
-SETTLED_M = 1e-5
+SETTLED_M, PUBLISHED_STEPS = 1e-5, 100
 
 
 def two_step(
@@ -48,10 +48,8 @@ def two_step(
     return alternate(readings, every, field_map, start, options, silent).estimate
 
 
-def published(
-    readings: Readings, field_map: QueryableMap, t_start: FloatArray, steps: int = 100
-) -> Estimate | None:
-    """Return where the paper's algorithm 1 ends, None if that is off the map.
+def as_published(readings: Readings, field_map: QueryableMap, t_start: FloatArray) -> FloatArray:
+    """Return t, C row by row and H where the paper's algorithm 1 ends, (15,); NaN off the map.
 
     Weights of the closed form are the map's variance to the power -2, as the printed norm has
     them; the Gauss-Newton step for t knows no weights. Three slips of the print are mended, for
@@ -67,11 +65,11 @@ def published(
         The guess in the lidar frame in metres, shape (3,).
     """
     t, R = t_start.copy(), readings.R_map_lidar
-    for _ in range(steps):
+    for _ in range(PUBLISHED_STEPS):
         sample = field_map.query(R @ t + readings.p_map_lidar)
         keep = sample.inside
         if keep.sum() < MIN_READINGS:
-            return None
+            return np.full(UNKNOWNS, np.nan)
         R_in, b_meas = R[keep], readings.field[keep]
         b_lidar = np.einsum("nji,nj->ni", R_in, sample.field[keep])
         weights = row_weights(sample.variance[keep].mean(axis=1), 0.0, PUBLISHED.weighting)
@@ -84,14 +82,7 @@ def published(
         t += step
         if np.abs(step).max() < SETTLED_M:
             break
-    none = np.zeros(1)
-    return Estimate(t[None], found.vector()[None], np.ones(1), none, none)
-
-
-def as_published(readings: Readings, field_map: QueryableMap, t_start: FloatArray) -> FloatArray:
-    """Return t, C row by row and H where the paper's algorithm ends, (15,); NaN off the map."""
-    end = published(readings, field_map, t_start)
-    return np.full(UNKNOWNS, np.nan) if end is None else end.vector(0)
+    return np.concatenate([t, found.vector()])
 
 
 def one_key_from(
@@ -113,44 +104,14 @@ def one_key_from(
 def cramer_rao(
     readings: Readings,
     field_map: QueryableMap,
-    sensor: KnownSensor,
+    truth: FloatArray,
     noise: float,
     options: OneKeyOptions,
 ) -> FloatArray:
-    """Return the least covariance of (t, C, H) of one sensor, shape (15, 15).
+    """Return the least covariance of (t, C, H, time offset) of one sensor, shape (16, 16).
 
     It is the inverse of the information at the truth, with the map's errors unknown, too, and
     their prior from the survey (the Bayesian bound of Van Trees).
-
-    Parameters
-    ----------
-    readings
-        Of the sensor.
-    field_map
-        The magnetic map, which has to know how its errors are correlated.
-    sensor
-        The truth.
-    noise
-        Standard deviation of the sensor's noise in uT.
-    options
-        Which of the readings enter.
-
-    Raises
-    ------
-    MapError
-        The map does not know how its errors are correlated.
-    """
-    none = np.zeros(1)
-    truth = Estimate(
-        sensor.t_lidar_mag[None], sensor.distortion.vector()[None], np.array([noise]), none, none
-    )
-    return bound_at(readings, field_map, truth, options)[:-1, :-1]
-
-
-def bound_at(
-    readings: Readings, field_map: QueryableMap, truth: Estimate, options: OneKeyOptions
-) -> FloatArray:
-    """Return the least covariance of (t, C, H, time offset) of one sensor, shape (16, 16).
 
     Parameters
     ----------
@@ -160,7 +121,9 @@ def bound_at(
     field_map
         The magnetic map, which has to know how its errors are correlated.
     truth
-        The sensor, without a ridge.
+        Of t, C row by row, H and the time offset, shape (16,).
+    noise
+        Standard deviation of the sensor's noise in uT.
     options
         Which of the readings enter, and how long errors of poses last.
 
@@ -175,12 +138,13 @@ def bound_at(
     """
     if not isinstance(field_map, UncertainMap):
         raise MapError("a bound needs a map that models how its errors are correlated: harmonic")
-    view = observe(readings, field_map, truth, options.min_readings)
+    known = Estimate(truth[None, :3], truth[None, 3:15], np.array([noise]), np.zeros(1), truth[15:])
+    view = observe(readings, field_map, known, options.min_readings)
     if not view.sensors:
         return np.full((16, 16), np.nan)
     # A bound knows that the drive's frame is the map's.
     shared = options.model_copy(update={"uncertainty": Uncertainty.FULL, "warp_m": 0.0})
-    (solution,) = stated_at(view, field_map, truth, shared).solved
+    (solution,) = stated_at(view, field_map, known, shared).solved
     return solution.joint_covariance
 
 

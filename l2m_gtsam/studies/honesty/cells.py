@@ -19,8 +19,7 @@ from l2m_gtsam.studies.honesty.drives import (
     start_near,
 )
 from l2m_gtsam.studies.json_arrays import JsonFloats
-from l2m_gtsam.studies.methods import bound_at
-from l2m_gtsam.validation.innovation import KnownCalibration, estimate_of
+from l2m_gtsam.studies.methods import cramer_rao
 
 PARAMETERS = 16
 OFFSET = slice(15, 16)
@@ -152,11 +151,10 @@ def bound_of(hall: MappedHall, disturbed: Disturbed, options: OneKeyOptions) -> 
     """Return the Cramer-Rao bound of the full model for one sensor, shape (16, 16).
 
     Of the readings that are not spoilt, which the solve has to find out by itself; see
-    ``bound_at``.
+    ``cramer_rao``.
     """
     drive = disturbed.drive
     readings = drive.readings.select(disturbed.change == 0)
     if readings.motion is not None:
         readings = with_offsets(readings, drive.trajectory, drive.offset)
-    known = [KnownCalibration(each, hall.noise, np.zeros((0, 3))) for each in drive.truth()]
-    return bound_at(readings, hall.field_map, estimate_of(known), options)
+    return cramer_rao(readings, hall.field_map, drive.truth()[0], hall.noise, options)

@@ -232,7 +232,8 @@ def drive_bound(
     drive: SiteDrive, field_map: QueryableMap, noise: float, options: OneKeyOptions
 ) -> FloatArray:
     """Return the root of the bound's trace over t, C and H, shape (3,)."""
-    variance = np.diagonal(cramer_rao(drive.readings, field_map, drive.sensor, noise, options))
+    truth = np.append(drive.sensor.vector(), 0.0)  # clocks are right
+    variance = np.diagonal(cramer_rao(drive.readings, field_map, truth, noise, options))
     return np.array([np.sqrt(variance[block].sum()) for block in BLOCKS])
 
 
