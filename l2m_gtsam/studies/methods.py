@@ -1,5 +1,8 @@
 """Methods that ours is compared with, each from a given start, and the Cramer-Rao bound."""
 
+from dataclasses import dataclass
+from time import process_time
+
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -9,8 +12,9 @@ from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings, reading
 from l2m_gtsam.calibration.forecast import stated_at
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.optimise import Optimizer, optimise
+from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts_around
 from l2m_gtsam.calibration.view import QueryableMap, StandIns, observe
-from l2m_gtsam.data import Distortion, FloatArray, Readings
+from l2m_gtsam.data import BoolArray, Distortion, FloatArray, KnownSensor, Readings
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import Uncertainty
@@ -28,10 +32,87 @@ PUBLISHED = ClosedFormOptions(weighting=Weighting.PAPER)
 SETTLED_M, PUBLISHED_STEPS = 1e-5, 100
 
 
+BLOCKS = (slice(0, 3), slice(3, 12), slice(12, 15))  # t, C, H
+
+
+def errors_of(vector: FloatArray, sensor: KnownSensor) -> FloatArray:
+    """Return the lengths of the errors of t, C (Frobenius) and H of N results, shape (N, 3).
+
+    ``vector`` is t in metres, C row by row and H in microtesla, shape (N, 15).
+    """
+    off = vector - sensor.vector()
+    return np.column_stack([np.linalg.norm(off[:, block], axis=1) for block in BLOCKS])
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """Where a method ended from N starts.
+
+    Attributes
+    ----------
+    vector
+        t, C row by row and H; NaN without a result, shape (N, 15).
+    solves
+        That were computed.
+    seconds
+        Of one core for a calibration from one start.
+    """
+
+    vector: FloatArray
+    solves: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class OneKeyResult(MethodResult):
+    """Where our method ended, and where it began.
+
+    Attributes
+    ----------
+    t_found
+        Where the search found the sensor in metres, NaN for nowhere, shape (N, 3).
+    ambiguous
+        Which of these places are not clearly the best, shape (N,).
+    """
+
+    t_found: FloatArray
+    ambiguous: BoolArray
+
+
+def one_key(
+    readings: Readings,
+    field_map: QueryableMap,
+    t_start: FloatArray,
+    search: StartOptions,
+    options: OneKeyOptions,
+) -> OneKeyResult:
+    """Return where the full method ends from each start, shape (N, 3).
+
+    Starts from which the search finds the same place share the solve from there.
+    """
+    begin = process_time()
+    found = [each[0] for each in find_starts_around(readings, field_map, t_start, search)]
+    none = np.full(3, np.nan)
+    t_found = np.array([none if each is None else each.t_lidar_mag for each in found])
+    ambiguous = np.array([each is not None and each.ambiguous(search.clear) for each in found])
+    searched = (process_time() - begin) / len(t_start)
+    places, which = np.unique(t_found, axis=0, return_inverse=True)
+    begin, somewhere = process_time(), np.flatnonzero(np.isfinite(places).all(axis=1))
+    ends = np.full((len(places), UNKNOWNS), np.nan)
+    for row in somewhere:
+        solution = solve_one_key(readings, field_map, places[row][None], options)
+        if solution.solved:
+            ends[row] = solution.estimate.vector(0)
+    solved = (process_time() - begin) / max(len(somewhere), 1)
+    return OneKeyResult(ends[which.ravel()], len(somewhere), searched + solved, t_found, ambiguous)
+
+
 def two_step(
     readings: Readings, field_map: QueryableMap, t_start: FloatArray, closed_form: ClosedFormOptions
-) -> Estimate:
+) -> FloatArray:
     """Return where closed form and translation graph settle in turns, without a joint graph.
+
+    As t, C row by row and H, shape (15,).
 
     Parameters
     ----------
@@ -45,7 +126,7 @@ def two_step(
     options = OneKeyOptions(closed_form=closed_form, alternation_readings=len(readings))
     start = start_estimate(t_start[None], options)
     every = StandIns.of(readings, len(readings))
-    return alternate(readings, every, field_map, start, options, silent).estimate
+    return alternate(readings, every, field_map, start, options, silent).estimate.vector(0)
 
 
 def as_published(readings: Readings, field_map: QueryableMap, t_start: FloatArray) -> FloatArray:
@@ -83,22 +164,6 @@ def as_published(readings: Readings, field_map: QueryableMap, t_start: FloatArra
         if np.abs(step).max() < SETTLED_M:
             break
     return np.concatenate([t, found.vector()])
-
-
-def one_key_from(
-    readings: Readings, field_map: QueryableMap, places: FloatArray, options: OneKeyOptions
-) -> FloatArray:
-    """Return t, C row by row and H of one sensor by our solve from each place, shape (N, 15).
-
-    Each by itself, as for a vehicle with one sensor; NaN from a place that is NaN, and where no
-    solution is found.
-    """
-    ends = np.full((len(places), UNKNOWNS), np.nan)
-    for row in np.flatnonzero(np.isfinite(places).all(axis=1)):
-        solution = solve_one_key(readings, field_map, places[row][None], options)
-        if solution.solved:
-            ends[row] = solution.estimate.vector(0)
-    return ends
 
 
 def cramer_rao(

@@ -43,7 +43,6 @@ def made_up(distortion: int, ring: int, errors: list[float]) -> RingCell:
         t_true=np.zeros(3),
         t_start=t_start,
         t_found=t_start,
-        margin=np.full(count, np.inf),
         ambiguous=np.arange(count) == 0,
         t_one_key=np.array(errors)[:, None] * np.array([1.0, 0.0, 0.0]),
         t_published=np.full((min(count, TINY.few_starts), 3), np.nan),
@@ -134,7 +133,7 @@ def test_intervals_are_wilsons(successes: int, trials: int) -> None:
 
 
 def test_cells_come_back_from_json() -> None:
-    lost = replace(tiny_cells()[0], t_one_key=np.full((3, 3), np.nan), margin=np.full(3, np.nan))
+    lost = replace(tiny_cells()[0], t_one_key=np.full((3, 3), np.nan))
     adapter = TypeAdapter(DistortionCells)
     cells = DistortionCells((lost, tiny_cells()[1]))
     back = adapter.validate_json(adapter.dump_json(cells))

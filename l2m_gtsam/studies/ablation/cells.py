@@ -13,11 +13,9 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.one_key import solve_one_key
-from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
+from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import Distortion, FloatArray, Readings
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import Uncertainty
@@ -26,7 +24,7 @@ from l2m_gtsam.simulate.sensors import NoiseOptions, SamplingOptions, SensorArra
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method, Weighting
 from l2m_gtsam.studies.ablation.map_image import MapImage, WindowOptions
 from l2m_gtsam.studies.json_arrays import JsonFloats
-from l2m_gtsam.studies.methods import two_step
+from l2m_gtsam.studies.methods import errors_of, one_key, two_step
 from l2m_gtsam.studies.site import (
     SiteDrive,
     SiteOptions,
@@ -202,13 +200,13 @@ def calibration_errors(
 ) -> FloatArray:
     """Return the errors of t, C and H of one calibration, shape (3,)."""
     drive = place.hall.drives[which]
-    truth, guess = drive.sensor, drive.sensor.t_lidar_mag + random_offset(options, which)
-    end = calibrated(options, place.field_map, drive.readings, guess, solver)
-    if end is None:
-        return np.full(3, np.nan)
-    found = Distortion.from_vector(end.distortion[0])
-    off = end.t[0] - truth.t_lidar_mag, found.C - truth.distortion.C, found.H - truth.distortion.H
-    return np.array([np.linalg.norm(each) for each in off])
+    guess = drive.sensor.t_lidar_mag + random_offset(options, which)
+    given = drive.readings, place.field_map
+    if solver is Solver.ONE_KEY:
+        end = one_key(*given, guess[None], options.search, options.solve).vector
+    else:
+        end = two_step(*given, guess, CLOSED_FORMS[solver])[None]
+    return np.asarray(errors_of(end, drive.sensor)[0])
 
 
 def random_offset(options: AblationOptions, which: int) -> FloatArray:
@@ -216,20 +214,3 @@ def random_offset(options: AblationOptions, which: int) -> FloatArray:
     rng = np.random.default_rng([options.seed, which, START])
     direction = rng.standard_normal(3)
     return np.asarray(options.guess * rng.uniform() * direction / np.linalg.norm(direction))
-
-
-def calibrated(
-    options: AblationOptions,
-    field_map: QueryableMap,
-    readings: Readings,
-    t_guess: FloatArray,
-    solver: Solver,
-) -> Estimate | None:
-    """Return what a method makes of the readings of one sensor; None for no result."""
-    if solver is not Solver.ONE_KEY:
-        return two_step(readings, field_map, t_guess, CLOSED_FORMS[solver])
-    (found,) = find_starts(readings, field_map, t_guess, options.search)
-    if found is None:
-        return None
-    solution = solve_one_key(readings, field_map, found.t_lidar_mag[None], options.solve)
-    return solution.estimate if solution.solved else None

@@ -23,12 +23,12 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts_around
-from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.calibration.start.global_start import StartOptions
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.calibration import FoundStart, Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.json_arrays import JsonBools, JsonFloats
-from l2m_gtsam.studies.methods import as_published, levenberg_marquardt, one_key_from
+from l2m_gtsam.studies.methods import as_published, levenberg_marquardt, one_key
 from l2m_gtsam.studies.site import Site, SiteDrive, SiteOptions, random_drive
 from l2m_gtsam.studies.statistics import Share
 
@@ -76,9 +76,6 @@ class RingCell:
         Given starts, shape (N, 3).
     t_found
         Where one-key started from, NaN where it found no start, shape (N, 3).
-    margin
-        How clearly, see ``FoundStart``; NaN where there is no second place, or none at all,
-        shape (N,).
     ambiguous
         Which calibrations one-key would call ambiguous, shape (N,).
     t_one_key
@@ -93,7 +90,6 @@ class RingCell:
     t_true: JsonFloats
     t_start: JsonFloats
     t_found: JsonFloats
-    margin: JsonFloats
     ambiguous: JsonBools
     t_one_key: JsonFloats
     t_published: JsonFloats
@@ -162,25 +158,6 @@ class BasinTable:
     all_medium: Share
 
 
-@dataclass(frozen=True)
-class FoundStarts:
-    """What the search found from N given starts; see ``RingCell``.
-
-    Attributes
-    ----------
-    t
-        Shape (N, 3).
-    margin
-        Shape (N,).
-    ambiguous
-        Shape (N,).
-    """
-
-    t: FloatArray
-    margin: FloatArray
-    ambiguous: BoolArray
-
-
 def cells_of(options: BasinOptions, site: Site, distortion: int) -> DistortionCells:
     """Calibrate one sensor from all starts of all rings."""
     rings = range(options.rings)
@@ -188,11 +165,7 @@ def cells_of(options: BasinOptions, site: Site, distortion: int) -> DistortionCe
     drive = random_drive(site, options.site, rng)
     t_true = drive.sensor.t_lidar_mag
     t_start = np.concatenate([random_starts(options, t_true, distortion, ring) for ring in rings])
-    found = search(site, drive, t_start, options.search)
-    # From the same place the solve ends in the same.
-    distinct, which = np.unique(found.t, axis=0, return_inverse=True)
-    ends = one_key_from(drive.readings, site.field_map, distinct, options.solve)
-    t_one_key = ends[which.ravel(), :3]
+    found = one_key(drive.readings, site.field_map, t_start, options.search, options.solve)
     cells = []
     for index, ring in enumerate(rings):
         rows = slice(index * options.starts, (index + 1) * options.starts)
@@ -202,10 +175,9 @@ def cells_of(options: BasinOptions, site: Site, distortion: int) -> DistortionCe
             ring=ring,
             t_true=t_true,
             t_start=t_start[rows],
-            t_found=found.t[rows],
-            margin=found.margin[rows],
+            t_found=found.t_found[rows],
             ambiguous=found.ambiguous[rows],
-            t_one_key=t_one_key[rows],
+            t_one_key=found.vector[rows, :3],
             t_published=np.array(
                 [as_published(drive.readings, site.field_map, t)[:3] for t in few]
             ),
@@ -224,19 +196,6 @@ def random_starts(
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     offset = options.width * (ring + rng.uniform(size=(options.starts, 1)))
     return np.asarray(t_true + offset * direction)
-
-
-def search(site: Site, drive: SiteDrive, t_start: FloatArray, options: StartOptions) -> FoundStarts:
-    """Return what one-key finds around each given start, shape (N, 3)."""
-    each = find_starts_around(drive.readings, site.field_map, t_start, options)
-    found = [starts[0] for starts in each]
-    nowhere = FoundStart(np.full(3, np.nan), np.inf, None)
-    margin = np.array([(start or nowhere).margin for start in found])
-    return FoundStarts(
-        np.array([(start or nowhere).t_lidar_mag for start in found]),
-        np.where(np.isfinite(margin), margin, np.nan),
-        np.array([start is not None and start.ambiguous(options.clear) for start in found]),
-    )
 
 
 def plain_lm(

@@ -25,7 +25,7 @@ from l2m_gtsam.simulate.route import RouteShape
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import NoiseOptions, SamplingOptions, SensorArrayOptions
 from l2m_gtsam.studies.json_arrays import JsonFloats
-from l2m_gtsam.studies.methods import cramer_rao
+from l2m_gtsam.studies.methods import BLOCKS, MethodResult, cramer_rao, errors_of, one_key
 from l2m_gtsam.studies.naive_peer import NaiveMap, NaiveOptions, naive_map, naive_peer
 from l2m_gtsam.studies.site import SiteDrive, SiteOptions, SurveyedSite, random_drive, surveyed
 from l2m_gtsam.studies.table1.methods import (
@@ -37,14 +37,11 @@ from l2m_gtsam.studies.table1.methods import (
     OURS,
     SLIDING,
     THINNED,
-    MethodResult,
     from_each,
     magyc,
-    one_key,
 )
 
 DRIVE, STARTS = 1, 2  # streams of randomness
-BLOCKS = (slice(0, 3), slice(3, 12), slice(12, 15))  # t, C, H
 
 
 class Table1Options(Options):
@@ -223,8 +220,7 @@ def other_ends(
 
 def ends_of(method: str, map_kind: str, drive: SiteDrive, found: MethodResult) -> Ends:
     """Return how far ends are from the truth."""
-    truth = drive.sensor.vector()
-    t, C, H = (np.linalg.norm((found.vector - truth)[:, block], axis=1) for block in BLOCKS)
+    t, C, H = errors_of(found.vector, drive.sensor).T
     return Ends(method, map_kind, t, C, H, found.seconds)
 
 

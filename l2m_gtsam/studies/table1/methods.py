@@ -1,19 +1,16 @@
 """The methods of Table I on one drive, from one start or from many."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from time import process_time
 
 import numpy as np
 from scipy.linalg import polar
 
-from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts_around
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
 from l2m_gtsam.studies.magyc_peer import ChipDrive, magyc_peer, magyc_python
-from l2m_gtsam.studies.methods import as_published, one_key_from, two_step
+from l2m_gtsam.studies.methods import MethodResult, as_published, two_step
 
 OURS, NAIVE, MAGYC = "one-key", "naive peer", "magyc"
 HARMONIC, SLIDING, THINNED, NO_MAP = "harmonic", "sliding_gp", "thinned GP", "none"
@@ -22,31 +19,12 @@ Solver = Callable[[Readings, QueryableMap, FloatArray], FloatArray]
 """From the readings of one sensor, a map and a start (3,) to t, C row by row and H, (15,)."""
 
 
-@dataclass(frozen=True)
-class MethodResult:
-    """Where a method ended from N starts.
-
-    Attributes
-    ----------
-    vector
-        t, C row by row and H; NaN without a result, shape (N, 15).
-    solves
-        That were computed.
-    seconds
-        Of one core for a calibration from one start.
-    """
-
-    vector: FloatArray
-    solves: int
-    seconds: float
-
-
 def in_two_steps(method: Method) -> Solver:
     """Return the alternation of a closed form with the translation graph."""
 
     def solve(readings: Readings, field_map: QueryableMap, t_start: FloatArray) -> FloatArray:
         inner = ClosedFormOptions(method=method)
-        return two_step(readings, field_map, t_start, inner).vector(0)
+        return two_step(readings, field_map, t_start, inner)
 
     return solve
 
@@ -79,26 +57,3 @@ def magyc(readings: Readings, C: FloatArray) -> MethodResult:
     R_mag_lidar = np.asarray(polar(C)[0])
     (found,) = magyc_peer([ChipDrive(readings, R_mag_lidar)], magyc_python())
     return MethodResult(np.append(np.full(12, np.nan), found.H)[None], 1, found.seconds)
-
-
-def one_key(
-    readings: Readings,
-    field_map: QueryableMap,
-    t_start: FloatArray,
-    search: StartOptions,
-    options: OneKeyOptions,
-) -> MethodResult:
-    """Return where the full method ends from each start, shape (N, 3).
-
-    Starts from which the search finds the same place share the solve from there.
-    """
-    begin = process_time()
-    found = [each[0] for each in find_starts_around(readings, field_map, t_start, search)]
-    none = np.full(3, np.nan)
-    t_found = np.array([none if each is None else each.t_lidar_mag for each in found])
-    searched = (process_time() - begin) / len(t_start)
-    places, which = np.unique(t_found, axis=0, return_inverse=True)
-    begin, solves = process_time(), int(np.isfinite(places).all(axis=1).sum())
-    vector = one_key_from(readings, field_map, places, options)
-    solved = (process_time() - begin) / max(solves, 1)
-    return MethodResult(vector[which.ravel()], solves, searched + solved)

@@ -7,10 +7,11 @@ import pytest
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.route import RouteShape
+from l2m_gtsam.studies.methods import MethodResult
 from l2m_gtsam.studies.naive_peer import NaiveMap
 from l2m_gtsam.studies.site import surveyed
 from l2m_gtsam.studies.table1.cells import SurveyedWarehouse, Table1Options, compute
-from l2m_gtsam.studies.table1.methods import HARMONIC, MethodResult
+from l2m_gtsam.studies.table1.methods import HARMONIC
 from tests.worlds.study_sites import one_row_site
 
 CELLS = "l2m_gtsam.studies.table1.cells"
