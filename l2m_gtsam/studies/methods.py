@@ -1,5 +1,6 @@
 """Methods that ours is compared with, each from a given start, and the Cramer-Rao bound."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import process_time
 
@@ -257,11 +258,11 @@ def closed_form(
     return fit_distortion(b_lidar, readings.field, weights, options.closed_form).distortion
 
 
-MOST_STEPS = 30
-
-
 def numeric_least_squares(
-    readings: Readings, field_map: QueryableMap, t_start: FloatArray
+    readings: Readings,
+    field: Callable[[FloatArray], FloatArray],
+    t_start: FloatArray,
+    steps: int = 30,
 ) -> FloatArray:
     """Return t, C row by row and H of S sensors, shape (S, 15).
 
@@ -269,21 +270,24 @@ def numeric_least_squares(
     ----------
     readings
         Of all sensors.
+    field
+        From places of the map frame in metres, shape (N, 3), to uT, shape (N, 3).
     t_start
         Where to start in the lidar frame in metres, shape (S, 3); C starts from I, H from zero.
+    steps
+        At most.
     """
     R, sensor = readings.R_map_lidar, readings.sensor
 
     def residuals(x: FloatArray) -> FloatArray:
         each = x.reshape(-1, UNKNOWNS)[sensor]
         places = np.einsum("nij,nj->ni", R, each[:, :3]) + readings.p_map_lidar
-        field, _ = field_map.field_and_gradient(places)
-        b_lidar = np.einsum("nji,nj->ni", R, field)
+        b_lidar = np.einsum("nji,nj->ni", R, field(places))
         C, H = each[:, 3:12].reshape(-1, 3, 3), each[:, 12:]
         return np.asarray(np.einsum("nij,nj->ni", C, b_lidar) + H - readings.field).ravel()
 
     ideal = np.tile(np.concatenate([np.eye(3).ravel(), np.zeros(3)]), (len(t_start), 1))
     start = np.hstack([t_start, ideal])
     # Columns in metres, ratios and microtesla: scaled by their own lengths.
-    end = least_squares(residuals, start.ravel(), x_scale="jac", max_nfev=MOST_STEPS)
+    end = least_squares(residuals, start.ravel(), x_scale="jac", max_nfev=steps)
     return np.asarray(end.x.reshape(-1, UNKNOWNS))

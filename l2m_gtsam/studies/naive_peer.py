@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 from pydantic import Field
-from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import Distortion, FloatArray, IntArray, Readings
+from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.errors import MapError, PeerError
 from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.options import Options
+from l2m_gtsam.studies.methods import numeric_least_squares
 
 FEWEST = 20
 
@@ -111,15 +111,8 @@ def naive_peer(
     """
     count = min(len(readings), options.readings)
     part = readings[np.linspace(0, len(readings) - 1, count).round().astype(np.int64)]
-
-    def residuals(x: FloatArray) -> FloatArray:
-        field = field_map.field(part.R_map_lidar @ x[:3] + part.p_map_lidar)
-        b_lidar = np.einsum("nji,nj->ni", part.R_map_lidar, field)
-        return (Distortion.from_vector(x[3:]).apply(b_lidar) - part.field).ravel()
-
-    start = np.concatenate([t_start, Distortion.identity().vector()])
-    end = least_squares(residuals, start, x_scale="jac", max_nfev=options.iterations)
-    return np.asarray(end.x)
+    found = numeric_least_squares(part, field_map.field, t_start[None], options.iterations)
+    return np.asarray(found[0])
 
 
 def _near(survey: TrainingSet, path: FloatArray, options: NaiveOptions) -> IntArray:

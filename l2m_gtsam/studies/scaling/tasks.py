@@ -97,7 +97,7 @@ def measured_solves(
     }
     if numeric:
         tasks[TimedTask.NUMERIC] = lambda: numeric_least_squares(
-            work.readings, work.field_map, work.t_true
+            work.readings, lambda x: work.field_map.field_and_gradient(x)[0], work.t_true
         )
     took = {task: taken(call, options.rounds, options.long) for task, call in tasks.items()}
     return tuple(
