@@ -1,6 +1,6 @@
 """A drive with changes and without: what is found, and what it costs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -87,42 +87,25 @@ class ChangesCell:
 
 
 def cell_of(options: ChangesStudyOptions, place: LoadedHall, number: int) -> ChangesCell:
-    """Calibrate on one path with and without changes."""
+    """Calibrate on one path without changes, and with those that there are on the first paths."""
     path = path_of(options, place.hall, drive_seed(place.seed, number))
+    hours, chosen = hours_of(path), CalibrationOptions()
+    as_mapped = recorded(options, place.hall, path, place.sensors, NO_STEEL)
+    clean = calibrate(as_mapped, place.field_map, chosen)
+    unchanged = ChangesCell(place.seed, (), 0, len(clean.sources), 0.0, hours, (), 0.0)
+    if number >= len(place.changes):
+        return unchanged
     changes = place.changes[number]
-    steel = changes.steel(options)
-    recordings = [
-        recorded(options, place.hall, path, place.sensors, each) for each in (NO_STEEL, steel)
-    ]
-    clean, changed = (calibrate(each, place.field_map, CalibrationOptions()) for each in recordings)
-    hours = hours_of(path)
-    points = read_at(recordings[1], place.sensors)
-    return ChangesCell(
-        hall=place.seed,
+    recording = recorded(options, place.hall, path, place.sensors, changes.steel(options))
+    changed = calibrate(recording, place.field_map, chosen)
+    points = read_at(recording, place.sensors)
+    return replace(
+        unchanged,
         changes=found_changes(changes, changed.sources, points, options),
         false_with=false_alarms(changed.sources, changes.positions),
-        false_without=len(clean.sources),
         hours_with=hours,
-        hours_without=hours,
         sensors=tuple(errors_of(each, clean, changed) for each in place.sensors),
         rejected=max(each.rejected for each in changed.sensors) / options.readings,
-    )
-
-
-def unchanged_cell(options: ChangesStudyOptions, place: LoadedHall, number: int) -> ChangesCell:
-    """Calibrate on one path on which nothing has changed."""
-    path = path_of(options, place.hall, drive_seed(place.seed, number))
-    recording = recorded(options, place.hall, path, place.sensors, NO_STEEL)
-    found = calibrate(recording, place.field_map, CalibrationOptions())
-    return ChangesCell(
-        hall=place.seed,
-        changes=(),
-        false_with=0,
-        false_without=len(found.sources),
-        hours_with=0.0,
-        hours_without=hours_of(path),
-        sensors=(),
-        rejected=0.0,
     )
 
 

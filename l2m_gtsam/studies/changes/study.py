@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from l2m_gtsam.studies.changes.cells import NEAR_M, ChangesCell, TrueChange, cell_of, unchanged_cell
+from l2m_gtsam.studies.changes.cells import NEAR_M, ChangesCell, TrueChange, cell_of
 from l2m_gtsam.studies.changes.loads import ChangesStudyOptions, LoadedHall, loaded_hall
 from l2m_gtsam.studies.statistics import Share, in_percent, rms_of
 from l2m_gtsam.studies.study import Study
@@ -99,9 +99,7 @@ class ChangesStudy(Study[ChangesStudyOptions, ChangesCell, ChangesSummary]):
 
     def compute(self, options: ChangesStudyOptions, key: str, shared: LoadedHall) -> ChangesCell:
         """Calibrate on one path."""
-        _, _, kind, number = key.split("-")
-        cell = unchanged_cell if kind == "unchanged" else cell_of
-        return cell(options, shared, int(number))
+        return cell_of(options, shared, int(key.split("-")[3]))
 
     def summarise(
         self, options: ChangesStudyOptions, cells: Mapping[str, ChangesCell]
