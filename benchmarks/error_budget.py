@@ -21,10 +21,11 @@ from l2m_gtsam.calibration.uncertain import solve_uncertain
 from l2m_gtsam.calibration.uncertain_graph import IndependentOptimum, UncertainDrive
 from l2m_gtsam.calibration.uncertain_rounds import settle_by_any
 from l2m_gtsam.calibration.view import RememberedMap, StandIns
-from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.data import Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import silent
+from l2m_gtsam.simulate.sensors import lasting
 from tests.worlds.exact import random_sensors
 
 OPTIONS = OneKeyOptions()
@@ -81,10 +82,7 @@ def wandering(readings: Readings) -> Readings:
 def misplaced(readings: Readings) -> Readings:
     """Return a drive whose positions are wrong for a while, for all sensors alike."""
     rng = np.random.default_rng(6)
-    seconds: FloatArray = 1e-9 * readings.stamp_ns[:EACH].astype(np.float64)
-    error = rng.standard_normal((EACH, 3))
-    for k, like in enumerate(np.exp(-np.diff(seconds) / POSE_S), start=1):
-        error[k] = like * error[k - 1] + np.sqrt(1 - like**2) * error[k]
+    error = lasting(rng.standard_normal((EACH, 3)), readings.stamp_ns[:EACH], POSE_S)
     shift = POSE_M * np.tile(error, (SENSORS, 1))
     return replace(readings, p_map_lidar=readings.p_map_lidar + shift)
 

@@ -16,6 +16,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions, pose_roots
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.simulate.hall_drives import STEP_NS, CalibrationDrive, calibration_drive, survey
+from l2m_gtsam.simulate.sensors import lasting
 from l2m_gtsam.simulate.steel_hall import SteelHall, steel_hall
 
 START = 6  # a stream of randomness
@@ -148,7 +149,9 @@ def spikes(drive: CalibrationDrive, seed: int) -> Disturbed:
 def troubled(drive: CalibrationDrive, seed: int) -> Disturbed:
     """Return a drive with clocks, poses and a tenth of its readings wrong."""
     spiked = spikes(driven(drive), seed)
-    return replace(spiked, drive=misplaced(mistimed(spiked.drive, seed), seed))
+    late, rng = mistimed(spiked.drive, seed), np.random.default_rng([seed, 8])
+    poses = misplaced(late.trajectory, POSE_NOISE, rng)
+    return replace(spiked, drive=placed(replace(late, trajectory=poses)))
 
 
 def driven(drive: CalibrationDrive) -> CalibrationDrive:
@@ -176,18 +179,13 @@ def mistimed(drive: CalibrationDrive, seed: int) -> CalibrationDrive:
     return placed(replace(drive, readings=readings, offset=offset))
 
 
-def misplaced(drive: CalibrationDrive, seed: int) -> CalibrationDrive:
-    """Return a drive whose poses are wrong by errors that last, as ``POSE_NOISE`` says."""
-    true, rng = drive.trajectory, np.random.default_rng([seed, 8])
-    seconds: FloatArray = 1e-9 * true.stamp_ns.astype(np.float64)
-    u = lasting(seconds, POSE_NOISE.lasting_s, rng)
-    sigmas = np.repeat([np.deg2rad(POSE_NOISE.rotation_deg or 0), POSE_NOISE.position_m or 0], 3)
-    # true = measured Exp(error)
-    turn, shift = np.split(u * sigmas, 2, axis=1)
+def misplaced(true: Trajectory, noise: PoseNoiseOptions, rng: np.random.Generator) -> Trajectory:
+    """Return poses that are wrong by errors that last: true = measured Exp(error)."""
+    sigmas = np.repeat([np.deg2rad(noise.rotation_deg or 0), noise.position_m or 0], 3)
+    white = sigmas * rng.standard_normal((len(true), 6))
+    turn, shift = np.split(lasting(white, true.stamp_ns, noise.lasting_s), 2, axis=1)
     R = true.R @ Rotation.from_rotvec(-turn).as_matrix()
-    p = true.p - np.einsum("nij,nj->ni", R, shift)
-    measured = Trajectory(true.stamp_ns, R, p, true.frame, true.child_frame)
-    return placed(replace(drive, trajectory=measured))
+    return replace(true, R=R, p=true.p - np.einsum("nij,nj->ni", R, shift))
 
 
 def placed(drive: CalibrationDrive) -> CalibrationDrive:
@@ -196,13 +194,3 @@ def placed(drive: CalibrationDrive) -> CalibrationDrive:
     readings: Readings = with_offsets(drive.readings, drive.trajectory, nothing)
     roots = pose_roots(drive.trajectory, readings.stamp_ns, POSE_NOISE)
     return replace(drive, readings=replace(readings, pose_root=roots))
-
-
-def lasting(seconds: FloatArray, lasts_s: float, rng: np.random.Generator) -> FloatArray:
-    """Return six Ornstein-Uhlenbeck processes of unit variance at times, shape (N, 6)."""
-    u = rng.standard_normal((len(seconds), 6))
-    like = np.exp(-np.diff(seconds) / lasts_s)
-    for n, rho in enumerate(like, start=1):
-        # The exact discretisation: fresh noise restores the unit variance.
-        u[n] = rho * u[n - 1] + np.sqrt(1 - rho**2) * u[n]
-    return u

@@ -105,12 +105,8 @@ def judged_drive(
 ) -> list[JudgedSensor]:
     """Return what the calibration of a drive says of each sensor; FAIL where there is none."""
     recording, truth = troubled_drive(options, place, trouble, number)
-    stated = trouble is Trouble.POSES_STATED
-    poses = PoseNoiseOptions(
-        position_m=options.pose_m if stated else None,
-        rotation_deg=options.pose_deg if stated else None,
-        correlation_s=options.pose_s,
-    )
+    unstated = PoseNoiseOptions(correlation_s=options.pose_s)
+    poses = options.pose_noise if trouble is Trouble.POSES_STATED else unstated
     chosen = CalibrationOptions(solve=OneKeyOptions(pose_noise=poses))
     try:
         found = calibrated(recording, place.field_map, chosen)

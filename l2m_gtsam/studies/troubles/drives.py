@@ -16,7 +16,7 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive
-from l2m_gtsam.studies.honesty.drives import drive_seed, driven, lasting
+from l2m_gtsam.studies.honesty.drives import drive_seed, driven, misplaced
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
 from l2m_gtsam.studies.troubles.surveys import Place, TroubledPlace
 
@@ -57,7 +57,7 @@ def troubled_drive(
     if trouble.has(Trouble.WARP):
         trajectory = bent(trajectory, options, rng)
     if trouble.has(Trouble.POSES) or trouble is Trouble.POSES_STATED:
-        trajectory = misplaced(trajectory, options, rng)
+        trajectory = misplaced(trajectory, options.pose_noise, rng)
     readings = replace(readings, field=readings.field + change)
     recorded = replace(drive, readings=readings, trajectory=trajectory)
     source = SourceFile(f"place-{place.truth.seed}-drive-{number}", "")
@@ -172,12 +172,3 @@ def bent(true: Trajectory, options: TroublesOptions, rng: np.random.Generator) -
     turn[:, 2] = 0.5 * (slope[:, 1, 0] - slope[:, 0, 1])  # half the curl
     R = Rotation.from_rotvec(turn).as_matrix() @ true.R
     return replace(true, R=R, p=true.p + shift)
-
-
-def misplaced(true: Trajectory, options: TroublesOptions, rng: np.random.Generator) -> Trajectory:
-    """Return poses that are wrong by errors that last: true = measured Exp(error)."""
-    seconds: FloatArray = 1e-9 * (true.stamp_ns - true.stamp_ns[0]).astype(np.float64)
-    sigmas = np.repeat([np.deg2rad(options.pose_deg), options.pose_m], 3)
-    turn, shift = np.split(lasting(seconds, options.pose_s, rng) * sigmas, 2, axis=1)
-    R = true.R @ Rotation.from_rotvec(-turn).as_matrix()
-    return replace(true, R=R, p=true.p - np.einsum("nij,nj->ni", R, shift))

@@ -8,6 +8,7 @@ from pydantic import Field
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.options import Options
+from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 
 
 class Trouble(StrEnum):
@@ -113,6 +114,13 @@ class TroublesOptions(Options):
     """When: between these shares of a drive, for all sensors at once."""
     map: MapOptions = MapOptions()
     """How the map is made of the survey, and of the structure that the LiDAR saw."""
+
+    @property
+    def pose_noise(self) -> PoseNoiseOptions:
+        """Errors of a drive's poses."""
+        return PoseNoiseOptions(
+            position_m=self.pose_m, rotation_deg=self.pose_deg, correlation_s=self.pose_s
+        )
 
     @property
     def suite_sigmas(self) -> FloatArray:
