@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.simulate.bag_writer import BagKind, Beside, WriterOptions, write_bag
+from l2m_gtsam.simulate.bag_writer import BagKind, WriterOptions, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.cloud import write_cloud
 from l2m_gtsam.storage.files import ensure_folder
@@ -61,17 +61,14 @@ def _write_bags(
 ) -> None:
     """Write both drives as bags of every kind."""
     options = WriterOptions(noise=scenario.options.noise)
-    mapping, calibration = scenario.mapping, scenario.calibration
-    truth = None if scenario.options.odometry is None else calibration.truth()
-    drives = {
-        "mapping": (mapping.recording, Beside(mapping.scans)),
-        "calibration": (calibration.recording, Beside(calibration.scans, truth)),
-    }
+    true = None if scenario.options.odometry is None else scenario.calibration.truth()
+    drives = {"mapping": (scenario.mapping, None), "calibration": (scenario.calibration, true)}
     written = 0
     for kind in kinds:
-        for name, (recording, beside) in drives.items():
+        for name, (drive, truth) in drives.items():
             progress("writing bags", written / (len(kinds) * len(drives)))
-            write_bag(out / bag_name(name, kind), kind, recording, options, beside)
+            path = out / bag_name(name, kind)
+            write_bag(path, kind, drive.recording, options, scans=drive.scans, truth=truth)
             written += 1
     progress("writing bags", 1.0)
 

@@ -1,9 +1,8 @@
 """Simulated recordings as real bags."""
 
-from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -15,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FieldSeries, IntArray, Recording, Trajectory
 from l2m_gtsam.errors import OutputError
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.scans import Scan
+from l2m_gtsam.simulate.lidar import SimulatedScans
 from l2m_gtsam.simulate.sensors import NoiseOptions
 from l2m_gtsam.storage.files import unwritten
 from l2m_gtsam.storage.parts import part_folder
@@ -34,16 +33,6 @@ MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 FLOAT32 = 7  # of PointField
-
-
-class Scans(Protocol):
-    """Scans of a drive, made one by one."""
-
-    @property
-    def stamp_ns(self) -> IntArray:
-        """When they begin, shape (N,)."""
-
-    def __getitem__(self, index: int, /) -> Scan: ...
 
 
 def magnetic_field(dialect: Dialect, series: FieldSeries, noise: float) -> Channel:
@@ -78,7 +67,7 @@ def poses(dialect: Dialect, trajectory: Trajectory, topic: str) -> Channel:
     return Channel(topic, POSE_STAMPED, trajectory.stamp_ns, message)
 
 
-def point_clouds(dialect: Dialect, scans: Scans, frame: str, topic: str) -> Channel:
+def point_clouds(dialect: Dialect, scans: SimulatedScans, frame: str, topic: str) -> Channel:
     """Return scans in single precision: x, y, z, and the seconds since the stamp if it has them."""
 
     def message(index: int) -> Any:
@@ -135,26 +124,14 @@ class WriterOptions(Options):
     """Seed of the latencies."""
 
 
-@dataclass(frozen=True)
-class Beside:
-    """What a bag may hold beside poses and readings.
-
-    Attributes
-    ----------
-    scans
-        Point clouds in the lidar frame, made one by one as they are written.
-    """
-
-    scans: Scans | None = None
-    truth: Trajectory | None = None
-
-
 def write_bag(
     path: Path,
     kind: BagKind,
     recording: Recording,
     options: WriterOptions | None = None,
-    beside: Beside | None = None,
+    *,
+    scans: SimulatedScans | None = None,
+    truth: Trajectory | None = None,
 ) -> None:
     """Write a recording as a bag: odometry, and one topic of readings in tesla per sensor.
 
@@ -168,9 +145,11 @@ def write_bag(
         File (ROS1, ending in ``.bag``) or folder (others).
     options
         Topics, latencies and stated noise.
-    beside
-        Scans and true poses. These are no odometry but ``PoseStamped``, so that a reader that looks
-        for poses by type takes those of the recording.
+    scans
+        Point clouds in the lidar frame, made one by one as they are written.
+    truth
+        True poses. They are no odometry but ``PoseStamped``, so that a reader that looks for poses
+        by type takes those of the recording.
 
     Raises
     ------
@@ -187,7 +166,7 @@ def write_bag(
         # rosbag2 repeats the folder's name inside, so the name is right and its parent temporary.
         with part_folder(path) as parent:
             unfinished = parent / path.name
-            _write(unfinished, kind, recording, options or WriterOptions(), beside or Beside())
+            _write(unfinished, kind, recording, options or WriterOptions(), scans, truth)
             if path.is_dir():  # a folder that is not empty cannot be renamed over
                 path.rename(parent / "replaced")
             unfinished.rename(path)
@@ -205,7 +184,12 @@ def _is_replaceable(path: Path, kind: BagKind) -> bool:
 
 
 def _write(
-    path: Path, kind: BagKind, recording: Recording, options: WriterOptions, beside: Beside
+    path: Path,
+    kind: BagKind,
+    recording: Recording,
+    options: WriterOptions,
+    scans: SimulatedScans | None,
+    truth: Trajectory | None,
 ) -> None:
     """Write all messages to a bag at this path."""
     dialect = ros1() if kind is BagKind.ROS1 else ros2()
@@ -215,11 +199,11 @@ def _write(
         *(magnetic_field(dialect, series, noise) for series in recording.series),
     ]
     # Last, so that the latencies of the others do not depend on them.
-    if beside.scans is not None:
+    if scans is not None:
         frame = recording.trajectory.child_frame
-        channels.append(point_clouds(dialect, beside.scans, frame, options.points_topic))
-    if beside.truth is not None:
-        channels.append(poses(dialect, beside.truth, options.truth_topic))
+        channels.append(point_clouds(dialect, scans, frame, options.points_topic))
+    if truth is not None:
+        channels.append(poses(dialect, truth, options.truth_topic))
     with _writer(path, kind) as writer:
         write_channels(writer, dialect, channels, _record_ns(channels, options))
 

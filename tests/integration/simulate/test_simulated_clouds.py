@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.simulate.bag_writer import BagKind, Beside, write_bag
+from l2m_gtsam.simulate.bag_writer import BagKind, write_bag
 from l2m_gtsam.simulate.lidar import SpinningLidarOptions
 from l2m_gtsam.simulate.odometry import OdometryDriftOptions
 from l2m_gtsam.simulate.recorder import SimulatedDrive
@@ -54,7 +54,7 @@ def bag_path(folder: Path, kind: BagKind) -> Path:
 
 def written(folder: Path, kind: BagKind, drive: SimulatedDrive) -> Path:
     path = bag_path(folder, kind)
-    write_bag(path, kind, drive.recording, beside=Beside(drive.scans, drive.truth()))
+    write_bag(path, kind, drive.recording, scans=drive.scans, truth=drive.truth())
     return path
 
 
@@ -147,7 +147,7 @@ def test_clouds_beside_a_recording_leave_its_messages_as_they_are(tmp_path: Path
     recording = plain().mapping.recording
     alone, beside = tmp_path / "alone", tmp_path / "beside"
     write_bag(alone, BagKind.MCAP, recording)
-    write_bag(beside, BagKind.MCAP, recording, beside=Beside(scanned().mapping.scans))
+    write_bag(beside, BagKind.MCAP, recording, scans=scanned().mapping.scans)
 
     def records(path: Path) -> list[tuple[str, int, bytes]]:
         with AnyReader([path]) as reader:
