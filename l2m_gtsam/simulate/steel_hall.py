@@ -199,6 +199,14 @@ class SteelHall:
     timber: tuple[SteelStructure, ...]
     floor: Floor
 
+    def field(self, points: FloatArray) -> FloatArray:
+        """Return the field in the map frame at points (N, 3) in uT, shape (N, 3)."""
+        return self.world.field(points)
+
+    def height(self, xy: FloatArray) -> FloatArray:
+        """Return the height of the floor at places (N, 2) in metres, shape (N,)."""
+        return self.floor.height(xy)
+
     def cloud(self) -> FloatArray:
         """Return what a LiDAR saw of its structures, shape (P, 3) in metres."""
         return np.concatenate([np.zeros((0, 3)), *(each.cloud() for each in self.steel)])

@@ -75,7 +75,7 @@ def smoothed(drive: CalibrationDrive, place: Place, constant_s: float) -> Calibr
         for index, sensor in enumerate(sensors):
             rows = readings.rows_of(index)
             R, p = then.R_map_lidar[rows], then.p_map_lidar[rows]
-            b_lidar = np.einsum("nji,nj->ni", R, place.field(p + R @ sensor.t_lidar_mag))
+            b_lidar = np.einsum("nji,nj->ni", R, place.built.field(p + R @ sensor.t_lidar_mag))
             change[rows] += share * b_lidar @ sensor.distortion.C.T
     return replace(drive, readings=replace(readings, field=readings.field + change))
 

@@ -34,73 +34,31 @@ SENSORS = 2
 
 
 @dataclass(frozen=True)
-class Hall:
-    """A hall of magnetised cuboids."""
+class Place:
+    """A place of which everything is known, and its seed."""
 
-    hall: SteelHall
+    built: SteelHall | OfficeCorridor
     seed: int
 
-    def field(self, points: FloatArray) -> FloatArray:
-        """Return the field in the map frame at points (N, 3) in uT, shape (N, 3)."""
-        return self.hall.world.field(points)
-
-    def floor(self, xy: FloatArray) -> FloatArray:
-        """Return the height of the floor at places (N, 2) in metres, shape (N,)."""
-        return self.hall.floor.height(xy)
-
-    def cloud(self) -> FloatArray:
-        """Return what a LiDAR saw of posts and racks, shape (M, 3), metres."""
-        return self.hall.cloud()
-
     def survey_way(self, options: TroublesOptions) -> FloatArray:
-        """Return lanes over the floor."""
+        """Return lanes over the floor of a hall, or to and fro in a corridor."""
+        if isinstance(self.built, OfficeCorridor):
+            return survey_way(self.built, self.seed, options.heights, options.survey_readings)
         chosen = options.heights, options.noise, options.survey_readings
-        return survey(self.hall, self.seed, *chosen).points
+        return survey(self.built, self.seed, *chosen).points
 
     def drive(self, options: TroublesOptions, seed: int) -> CalibrationDrive:
-        """Return a drive round posts and racks."""
+        """Return a drive round posts and racks, or to and fro."""
         span = (min(options.heights), max(options.heights))
-        return calibration_drive(self.hall, seed, span, options.noise, SENSORS, options.readings)
-
-
-@dataclass(frozen=True)
-class Corridor:
-    """An office corridor of rods and sheets."""
-
-    office: OfficeCorridor
-    seed: int
-
-    def field(self, points: FloatArray) -> FloatArray:
-        """Return the field in the map frame at points (N, 3) in uT, shape (N, 3)."""
-        return self.office.field(points)
-
-    def floor(self, xy: FloatArray) -> FloatArray:
-        """Return the height of the floor at places (N, 2) in metres, shape (N,)."""
-        return self.office.height(xy)
-
-    def cloud(self) -> FloatArray:
-        """Return what a LiDAR saw of door frames, lift doors, radiators and cable trays."""
-        return self.office.cloud()
-
-    def survey_way(self, options: TroublesOptions) -> FloatArray:
-        """Return lanes to and fro."""
-        return survey_way(self.office, self.seed, options.heights, options.survey_readings)
-
-    def drive(self, options: TroublesOptions, seed: int) -> CalibrationDrive:
-        """Return a drive to and fro."""
-        span = (min(options.heights), max(options.heights))
-        return office_drive(self.office, seed, span, options.noise, SENSORS, options.readings)
-
-
-Place = Hall | Corridor
-"""A place of which everything is known."""
+        chosen = seed, span, options.noise, SENSORS, options.readings
+        if isinstance(self.built, OfficeCorridor):
+            return office_drive(self.built, *chosen)
+        return calibration_drive(self.built, *chosen)
 
 
 def place_of(world: World, seed: int) -> Place:
     """Return a place of a kind by its seed."""
-    if world is World.HALL:
-        return Hall(steel_hall(seed), seed)
-    return Corridor(office_corridor(seed), seed)
+    return Place(steel_hall(seed) if world is World.HALL else office_corridor(seed), seed)
 
 
 ASIDE_M = 0.25  # of the suite's sensors from the middle of the vehicle
@@ -125,7 +83,7 @@ def troubled_place(
     if trouble is not Trouble.SUITE_STATED:
         suite = {name: replace(each, covariance=None) for name, each in suite.items()}
     chosen = MappingOptions(model=options.map)
-    learnt = map_recordings([recording], suite, chosen, truth.cloud())
+    learnt = map_recordings([recording], suite, chosen, truth.built.cloud())
     return TroubledPlace(truth, for_solvers(learnt))
 
 
@@ -164,7 +122,7 @@ class SurveyDrive:
         series = []
         for index, (known, draw) in enumerate(zip(suite.values(), draws, strict=True)):
             true, own = _off(known, draw) if off else known, self.sensor == index
-            B = truth.field(self.R[own] @ true.t_lidar_mag + self.p[own])
+            B = truth.built.field(self.R[own] @ true.t_lidar_mag + self.p[own])
             field = true.distortion.apply(np.einsum("nji,nj->ni", self.R[own], B)) + noise[own]
             name = known.sensor
             series.append(FieldSeries(name, f"/{name}", name, stamps[own], field))
@@ -180,7 +138,7 @@ def survey_of(truth: Place, options: TroublesOptions) -> SurveyDrive:
     yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
     R = Rotation.from_euler("Z", yaw[:, None]).as_matrix()
     height = np.array(options.heights)
-    floor = truth.floor(points[:, :2])
+    floor = truth.built.height(points[:, :2])
     sensor = np.abs((points[:, 2] - floor)[:, None] - height).argmin(axis=1)
     t = np.stack([each.t_lidar_mag for each in known_suite(options).values()])[sensor]
     return SurveyDrive(truth.seed, sensor, R, points - np.einsum("nij,nj->ni", R, t), options.noise)

@@ -46,7 +46,8 @@ def surveyed(times: float) -> HarmonicMap:
         name: replace(each, covariance=times**2 * covariance_of(each) if times else None)
         for name, each in right.items()
     }
-    found = map_recordings([recorded], stated, MappingOptions(model=OPTIONS.map), place.cloud())
+    chosen = MappingOptions(model=OPTIONS.map)
+    found = map_recordings([recorded], stated, chosen, place.built.cloud())
     assert isinstance(found, HarmonicMap)
     return found
 

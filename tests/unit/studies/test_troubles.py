@@ -127,7 +127,7 @@ def test_a_survey_reads_where_its_suite_is(world: World) -> None:
     for index, (name, known) in enumerate(suite.items()):
         own = survey.sensor == index
         R, field = survey.R[own], recording.series[index].field
-        expected = place.field(R @ known.t_lidar_mag + survey.p[own])
+        expected = place.built.field(R @ known.t_lidar_mag + survey.p[own])
         read = np.einsum("nij,nj->ni", R, field)
         assert recording.series[index].sensor == name
         # Readings of 0.2 uT of noise and no other error.
