@@ -205,10 +205,10 @@ class CellFolder(Generic[Cell]):
         """
         path.mkdir(parents=True, exist_ok=True)
         wanted = {"study": study.name} | options.model_dump(mode="json", exclude=set(study.size))
-        conditions = path / CONDITIONS
+        conditions, text = path / CONDITIONS, json.dumps(wanted, allow_nan=False)
         if not conditions.exists():
-            write_text(conditions, json.dumps(wanted, allow_nan=False))
-        elif read_json(conditions) != wanted:
+            write_text(conditions, text)
+        elif read_content(conditions, MAX_BYTES, ConfigError) != text.encode():
             raise ConfigError(
                 f"{path}: holds cells of a study with other options; choose another --out"
             )
@@ -231,23 +231,9 @@ class CellFolder(Generic[Cell]):
         if not file.exists():
             return None
         try:
-            return self.content.validate_python(read_json(file))
+            return self.content.validate_json(read_content(file, MAX_BYTES, ConfigError))
         except ValidationError as error:
             raise ConfigError(f"{file}: not a cell of this study; remove it") from error
-
-
-def read_json(path: Path) -> Any:
-    """Return what a file holds.
-
-    Raises
-    ------
-    ConfigError
-        It is not JSON.
-    """
-    try:
-        return json.loads(read_content(path, MAX_BYTES, ConfigError))
-    except (RecursionError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot be read as JSON; remove it") from error
 
 
 @lru_cache(maxsize=1)
