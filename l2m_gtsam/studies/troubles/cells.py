@@ -1,8 +1,9 @@
 """The drives through one place under one condition: errors, covariances and verdicts."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.stats import f
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrated
@@ -17,36 +18,13 @@ from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.studies.statistics import LEVEL
 from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 from l2m_gtsam.studies.troubles.surveys import TroubledPlace
 
 BLOCKS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15)}
-
-
-@dataclass(frozen=True)
-class Checked:
-    """What the check on parts of the drive says of t, of C or of H, and what is true.
-
-    Attributes
-    ----------
-    name
-        ``t``, ``C`` or ``H``.
-    distance
-        Squared distance from the truth in the covariance of noise and map.
-    ratios
-        Variances by the scatter over those of noise and map: of 16 and 8 parts by time, and as many
-        by place.
-    directions, freedom
-        In how many directions errors differ, by the scatter itself, and how well each ratio is
-        known.
-    """
-
-    name: str
-    distance: float
-    ratios: tuple[float, ...]
-    directions: tuple[float, ...]
-    freedom: tuple[float, ...]
+EIGHT_PARTS = (1, 3)  # of the divisions of a drive: the longest parts by time, and by place
 
 
 @dataclass(frozen=True)
@@ -65,8 +43,8 @@ class JudgedSensor:
     unmodelled
         The largest factor of the check on parts of the drive.
     alone
-        What the check on parts says alone, without the processes that were found; none where
-        errors are not shared.
+        Of t, C and H by name, whether the 95 % ellipsoid of the check on parts alone holds the
+        truth, without the processes that were found; empty where errors are not shared.
     """
 
     level: str
@@ -75,7 +53,7 @@ class JudgedSensor:
     error_m: float | None
     sigma_m: float | None
     unmodelled: float
-    alone: tuple[Checked, ...] = ()
+    alone: dict[str, bool] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -122,7 +100,9 @@ def judged_drive(
     for each in solve_by_parts(
         solution.readings, found.solver_map, solution.estimate.t, chosen.solve
     ):
-        judged[each.sensor] = with_check(judged[each.sensor], each, truth[each.sensor])
+        if judged[each.sensor].distance is not None:
+            alone = held_alone(each, truth[each.sensor])
+            judged[each.sensor] = replace(judged[each.sensor], alone=alone)
     return judged
 
 
@@ -143,22 +123,16 @@ def judged_sensor(found: SensorCalibration, truth: KnownSensor, level: Level) ->
     )
 
 
-def with_check(judged: JudgedSensor, alone: ByParts, truth: KnownSensor) -> JudgedSensor:
-    """Return what is said of a sensor, with what the check on parts says alone."""
-    if judged.distance is None:
-        return judged
-    e, P = alone.vector - truth.vector(), alone.covariance
-    checked = []
+def held_alone(alone: ByParts, truth: KnownSensor) -> dict[str, bool]:
+    """Return whether the 95 % ellipsoids of the check alone hold t, C and H.
+
+    The variance is that of eight parts by time or by place, whichever scatter more, as errors
+    last in one or the other; it is known by few parts and few directions, whence Fisher's
+    distribution.
+    """
+    e, P, held = alone.vector - truth.vector(), alone.covariance, dict[str, bool]()
     for name, at in BLOCKS.items():
-        ratios = alone.ratios[name]
-        distance = float(e[at] @ np.linalg.solve(P[at, at], e[at]))
-        checked.append(
-            Checked(
-                name,
-                distance,
-                tuple(each.value for each in ratios),
-                tuple(each.directions for each in ratios),
-                tuple(each.freedom for each in ratios),
-            )
-        )
-    return replace(judged, alone=tuple(checked))
+        ratio = max((alone.ratios[name][k] for k in EIGHT_PARTS), key=lambda each: each.value)
+        limit = len(e[at]) * f.ppf(LEVEL, ratio.directions, ratio.freedom)
+        held[name] = bool(e[at] @ np.linalg.solve(P[at, at], e[at]) / ratio.value <= limit)
+    return held

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import f
 
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.statistics import (
@@ -18,13 +17,12 @@ from l2m_gtsam.studies.statistics import (
     rms_of,
 )
 from l2m_gtsam.studies.study import Study
-from l2m_gtsam.studies.troubles.cells import Checked, JudgedSensor, TroublesCell, cell_of
+from l2m_gtsam.studies.troubles.cells import JudgedSensor, TroublesCell, cell_of
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 from l2m_gtsam.studies.troubles.surveys import TroubledPlace, troubled_place
 
 TARGET = 0.93  # of the PASS whose 95 % ellipsoid should hold the truth
-DOF_T, DOF_C, DOF_H, DOF = 3, 9, 3, 15
-EIGHT_PARTS = (1, 3)  # of the divisions of a drive: the longest parts by time, and by place
+DOF_T, DOF = 3, 15
 COLOURS = {Level.PASS: "#009e73", Level.WARN: "#e69f00", Level.FAIL: "#d55e00"}
 
 
@@ -209,9 +207,9 @@ def row_of(world: World, trouble: Trouble, found: list[JudgedSensor]) -> Trouble
         passed_t=within([each.distance_t for each in passed], DOF_T),
         passed=within([each.distance for each in passed], DOF),
         flagged=sum(each.unmodelled > 1 for each in found),
-        alone_t=by_check(known, "t", DOF_T),
-        alone_C=by_check(known, "C", DOF_C),
-        alone_H=by_check(known, "H", DOF_H),
+        alone_t=by_check(known, "t"),
+        alone_C=by_check(known, "C"),
+        alone_H=by_check(known, "H"),
         error_m=rms_of([each.error_m for each in known]),
         sigma_m=rms_of([each.sigma_m for each in known]),
     )
@@ -229,24 +227,10 @@ def within(distances: list[Any], dof: int) -> Share | None:
     return Share(int(ellipsoid_coverage(np.array(distances), dof).sum()), len(distances))
 
 
-def by_check(known: list[JudgedSensor], name: str, dof: int) -> Share | None:
-    """Return how many 95 % ellipsoids of the check alone hold the truth in t, C or H.
-
-    The variance is that of eight parts by time or by place, whichever scatter more, as errors
-    last in one or the other; it is known by few parts and few directions, whence Fisher's
-    distribution.
-    """
-    found = [each for sensor in known for each in sensor.alone if each.name == name]
-    if not found:
-        return None
-    return Share(sum(inside(each, dof) for each in found), len(found))
-
-
-def inside(found: Checked, dof: int) -> bool:
-    """Return whether the 95 % ellipsoid of the check alone holds the truth."""
-    k = max(EIGHT_PARTS, key=lambda each: found.ratios[each])
-    limit = f.ppf(LEVEL, found.directions[k], found.freedom[k])
-    return bool(found.distance / found.ratios[k] <= dof * limit)
+def by_check(known: list[JudgedSensor], name: str) -> Share | None:
+    """Return how many 95 % ellipsoids of the check alone hold the truth in t, C or H."""
+    held = [each.alone[name] for each in known if each.alone]
+    return Share(sum(held), len(held)) if held else None
 
 
 TROUBLES = TroublesStudy()

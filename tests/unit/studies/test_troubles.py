@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from l2m_gtsam.calibration.parts_alone import ByParts, PartsRatio
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.records.verdict import Level
-from l2m_gtsam.studies.troubles.cells import Checked, JudgedSensor, TroublesCell
+from l2m_gtsam.studies.troubles.cells import JudgedSensor, TroublesCell, held_alone
 from l2m_gtsam.studies.troubles.drives import (
     bent,
     linear_over,
@@ -25,7 +26,6 @@ from l2m_gtsam.studies.troubles.study import (
     TROUBLES,
     CellName,
     TroublesSummary,
-    inside,
     kind,
     row_of,
 )
@@ -141,25 +141,24 @@ def judged(level: Level, distance: float | None) -> JudgedSensor:
     return JudgedSensor(level.value, distance, distance, known, known, 1.0)
 
 
-def test_the_check_alone_takes_the_larger_scatter() -> None:
+@pytest.mark.parametrize(("distance", "holds"), [(2 * 3 * 3.23, True), (2 * 3 * 3.25, False)])
+def test_the_check_alone_takes_the_larger_scatter(distance: float, holds: bool) -> None:
     """Of eight parts by time or by place; with 3 and 16 degrees of freedom up to 3 * 3.24."""
-    by_time = (1.0, 2.0, 1.0, 1.5)
-    for distance, holds in ((2 * 3 * 3.23, True), (2 * 3 * 3.25, False)):
-        freedom = (32.0, 16.0, 32.0, 8.0)
-        assert inside(Checked("t", distance, by_time, (3.0,) * 4, freedom), 3) is holds
-    row = row_of(
-        World.HALL,
-        Trouble.CLEAN,
-        [
-            replace(
-                judged(Level.PASS, 3.0), alone=(Checked("t", d, by_time, (3.0,) * 4, (9.0,) * 4),)
-            )
-            for d in (1.0, 100.0)
-        ],
-    )
+    truth = KnownSensor.ideal("mag")
+    values, freedoms = (1.0, 2.0, 1.0, 1.5), (32.0, 16.0, 32.0, 8.0)
+    ratios = tuple(PartsRatio(v, 3.0, n) for v, n in zip(values, freedoms, strict=True))
+    vector = truth.vector() + np.append(np.sqrt(distance), np.zeros(14))
+    found = ByParts(0, vector, np.eye(15), dict.fromkeys("tCH", ratios))
+    assert held_alone(found, truth) == {"t": holds, "C": True, "H": True}
+
+
+def test_what_the_check_alone_holds_is_counted() -> None:
+    sensor = judged(Level.PASS, 3.0)
+    found = [replace(sensor, alone={"t": held, "C": True, "H": True}) for held in (True, False)]
+    row = row_of(World.HALL, Trouble.CLEAN, [*found, sensor])
     assert row.alone_t is not None
     assert (row.alone_t.successes, row.alone_t.trials) == (1, 2)
-    assert row.alone_C is None
+    assert row_of(World.HALL, Trouble.CLEAN, [sensor]).alone_C is None
 
 
 def test_conditions_are_counted() -> None:
