@@ -74,20 +74,10 @@ class TroubleRow:
 
 @dataclass(frozen=True)
 class TroublesSummary:
-    """All conditions in each kind of places, in the order of ``Trouble``.
-
-    Attributes
-    ----------
-    options, rows
-        Of the study, and its rows.
-    lasting
-        Whether the check alone counts what a fit takes of errors that last; tables that were made
-        before it did do not.
-    """
+    """All conditions in each kind of places, in the order of ``Trouble``."""
 
     options: TroublesOptions
     rows: tuple[TroubleRow, ...]
-    lasting: bool = False
 
 
 class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
@@ -132,7 +122,7 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
         for cell in cells.values():
             gathered[cell.world, cell.trouble] += cell.sensors
         rows = tuple(row_of(*each, found) for each, found in gathered.items() if found)
-        return TroublesSummary(options, rows, lasting=True)
+        return TroublesSummary(options, rows)
 
     def page_context(self, summary: TroublesSummary) -> dict[str, Any]:
         """Return what the text compares with."""

@@ -196,7 +196,7 @@ def test_conditions_are_counted() -> None:
 def test_the_page_tells_of_the_places_that_there_are(world: str, places: str, others: str) -> None:
     options = TroublesOptions(surveys=2, worlds=(World(world),))
     row = row_of(World(world), Trouble.CLEAN, [judged(Level.PASS, 10.0)])
-    page = TROUBLES.page(TroublesSummary(options, (row,), lasting=True))
+    page = TROUBLES.page(TroublesSummary(options, (row,)))
     assert page.startswith(places)
     assert others not in page.lower()
 
