@@ -64,47 +64,6 @@ class MapImage:
     inside: float
 
 
-@dataclass(frozen=True)
-class ImageWindow:
-    """Points of a picture.
-
-    Attributes
-    ----------
-    x, y
-        Of columns and rows in metres, ascending, shapes (C,) and (R,).
-    z
-        Height in metres.
-    """
-
-    x: FloatArray
-    y: FloatArray
-    z: float
-
-    @property
-    def points(self) -> FloatArray:
-        """In the map frame in metres, row by row, shape (R C, 3)."""
-        x, y = np.meshgrid(self.x, self.y)
-        return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, self.z)])
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Left, right, bottom and top in metres, up to half a step beyond the points."""
-        half = (self.x[1] - self.x[0]) / 2
-        ends = (self.x[0] - half, self.x[-1] + half, self.y[0] - half, self.y[-1] + half)
-        left, right, bottom, top = (round(float(end), 6) for end in ends)
-        return left, right, bottom, top
-
-    def image(self, values: FloatArray) -> FloatArray:
-        """Return the strength of fields at the points, shape (R C, 3), as rows and columns."""
-        return np.asarray(np.linalg.norm(values, axis=1).reshape(len(self.y), len(self.x)))
-
-    def within(self, points: FloatArray) -> FloatArray:
-        """Return x and y of those of the points, shape (N, 3), that it shows, shape (F, 2)."""
-        left, right, bottom, top = self.extent
-        x, y = points[:, 0], points[:, 1]
-        return points[(x > left) & (x < right) & (y > bottom) & (y < top), :2]
-
-
 def map_image(
     field_map: QueryableMap,
     part: SurveyedSite,
@@ -125,32 +84,36 @@ def map_image(
     options
         The part that is drawn.
     """
-    window = window_around(drives[0].readings.p_map_lidar[0], part.survey.points, options)
+    start, survey = drives[0].readings.p_map_lidar[0], part.survey.points
+    x, y = (
+        middle + np.arange(-extent / 2, extent / 2 + options.step / 2, options.step)
+        for middle, extent in ((start[0], options.width), (start[1], options.height))
+    )
+    z, half = float(survey[:, 2].min() + survey[:, 2].max()) / 2, (x[1] - x[0]) / 2
+    ends = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
+    left, right, bottom, top = (round(float(end), 6) for end in ends)
+    points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z)], axis=-1).reshape(-1, 3)
+    shown = np.all((survey[:, :2] > [left, bottom]) & (survey[:, :2] < [right, top]), axis=1)
+
+    def image(field: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(field, axis=1).reshape(len(y), len(x)))
+
     places = np.concatenate([sensor_places(each) for each in drives])
     sample = field_map.query(places)
     inside = sample.inside
     off = sample.field[inside] - part.world.field(places[inside])
     return MapImage(
-        extent=window.extent,
-        z=window.z,
-        strength=window.image(field_map.query(window.points).field),
-        truth=window.image(field_outside(part.world, window.points)),
-        fingerprints=window.within(part.survey.points),
+        extent=(left, right, bottom, top),
+        z=z,
+        strength=image(field_map.query(points).field),
+        truth=image(field_outside(part.world, points)),
+        fingerprints=survey[shown, :2],
         readings=len(part.survey),
         per_m2=len(part.survey) / floor,
         rmse=float(np.sqrt(np.mean(off**2))),
         sigma=float(np.sqrt(np.mean(sample.variance[inside]))),
         inside=float(np.mean(inside)),
     )
-
-
-def window_around(centre: FloatArray, survey: FloatArray, options: WindowOptions) -> ImageWindow:
-    """Return a window about a place (3,) in metres, in the middle of the survey's heights."""
-    x, y = (
-        centre[axis] + np.arange(-extent / 2, extent / 2 + options.step / 2, options.step)
-        for axis, extent in enumerate((options.width, options.height))
-    )
-    return ImageWindow(x, y, float(survey[:, 2].min() + survey[:, 2].max()) / 2)
 
 
 def sensor_places(drive: SiteDrive) -> FloatArray:
