@@ -42,17 +42,12 @@ STYLES = {
     TimedTask.BATCH: ("#0072b2", "o"),
     TimedTask.STARTED: ("#56b4e9", "s"),
 }
-LABELS = {
-    Quantity.READINGS: "readings of one sensor",
-    Quantity.SENSORS: "sensors",
-    Quantity.SURVEY: "readings of the survey",
-    Quantity.WORKERS: "workers",
-}
+# Of an axis, of a panel, and of a part of the page.
 TITLES = {
-    Quantity.READINGS: "a calibration",
-    Quantity.SENSORS: "a calibration of several",
-    Quantity.SURVEY: "a map",
-    Quantity.WORKERS: "a batch of calibrations",
+    Quantity.READINGS: ("readings of one sensor", "a calibration", "Readings"),
+    Quantity.SENSORS: ("sensors", "a calibration of several", "Sensors"),
+    Quantity.SURVEY: ("readings of the survey", "a map", "Size of the map"),
+    Quantity.WORKERS: ("workers", "a batch of calibrations", "Workers"),
 }
 ROOM = 1.6  # beside the first and last size
 
@@ -128,6 +123,7 @@ class ScalingStudy(Study[ScalingOptions, ScalingCell, ScalingTable]):
         parts = ((part, [c for c in summary.curves if c.part is part]) for part in Quantity)
         return {
             "parts": [(part, curves) for part, curves in parts if curves],
+            "titles": TITLES,
             "time_table": time_table,
             "has_memory": lambda curves: any(
                 p.peak_mib is not None for c in curves for p in c.points
@@ -205,7 +201,8 @@ def points(curve: Curve) -> tuple[FloatArray, FloatArray]:
 def finish(axes: Axes, part: Quantity, curves: list[Curve]) -> None:
     """Set scales, ticks at the measured sizes, and words."""
     sizes = sorted({each.size for curve in curves for each in curve.points})
-    axes.set(xscale="log", yscale="log", xlabel=LABELS[part], title=TITLES[part])
+    label, title, _ = TITLES[part]
+    axes.set(xscale="log", yscale="log", xlabel=label, title=title)
     seconds = "seconds" if part is Quantity.WORKERS else "seconds of one core"
     axes.set_ylabel(seconds)
     axes.set_xlim(sizes[0] / ROOM, sizes[-1] * ROOM)
