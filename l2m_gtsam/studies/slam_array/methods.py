@@ -79,7 +79,7 @@ def computed(options: SlamArrayOptions, key: str, drive: DriveInMap) -> SlamArra
     """Return a cell."""
     *_, kind, number = key.split("-")
     drift, seed, truth = Drift(kind), int(number), drive.truth
-    odometry = drive.drifted(truth, drift, np.random.default_rng(seed))
+    odometry = drive.drifted[drift](truth, np.random.default_rng(seed))
     recording, chosen = drive.with_odometry(odometry), drive.options[drift]
     calibration, field_map = drive.calibration, drive.field_map
     in_map = measured(lambda: localise(recording, field_map, calibration, chosen, silent).result)

@@ -4,7 +4,7 @@ Each place has the map of other drives, the calibration of its sensors, and one 
 poses are known. Odometry is made of these.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -86,7 +86,7 @@ class DriveInMap:
     field_map
         By other drives.
     drifted
-        Returns odometry with a kind of drift, with the errors of a generator.
+        By kind of drift, what returns odometry with the errors of a generator.
     options
         Of a localisation, by kind of drift.
     """
@@ -94,7 +94,7 @@ class DriveInMap:
     recording: Recording
     calibration: CalibrationResult
     field_map: QueryableMap
-    drifted: Callable[[Trajectory, Drift, np.random.Generator], Trajectory]
+    drifted: Mapping[Drift, Callable[[Trajectory, np.random.Generator], Trajectory]]
     options: dict[Drift, SlamOptions]
 
     @property
@@ -124,7 +124,8 @@ def robot(folder: Path, run: int) -> DriveInMap:
         kind: SlamOptions.model_validate({**common, "drift": {**FLOOR, **own}})
         for kind, own in WHEELS.items()
     }
-    return DriveInMap(drive, others.suite, for_solvers(others.field_map), wheels, options)
+    drifted = {Drift.SLIP: slipping_on_floor, Drift.WALK: walked}
+    return DriveInMap(drive, others.suite, for_solvers(others.field_map), drifted, options)
 
 
 def array(folder: Path, run: int) -> DriveInMap:
@@ -163,7 +164,7 @@ def array(folder: Path, run: int) -> DriveInMap:
         recording,
         given_sensors(known, ARRAY_UT),
         for_solvers(field_map),
-        carried,
+        {Drift.SLIP: slipping, Drift.WALK: walked},
         dict.fromkeys(Drift, options),
     )
 
@@ -174,18 +175,17 @@ def simulated(world: ScenarioOptions) -> DriveInMap:
     suite = {each.sensor: each for each in made.suite}
     field_map = map_recordings([made.mapping.recording], suite, MappingOptions())
     recording = replace(made.calibration.recording, trajectory=made.calibration.truth())
-
-    def drifted(truth: Trajectory, drift: Drift, rng: np.random.Generator) -> Trajectory:
-        walk = OdometryDriftOptions(scale=0.0, position_walk=WALK_M, frame="map")
-        scale = OdometryDriftOptions(frame="map")
-        return drifting(truth, walk if drift is Drift.WALK else scale, world.noise, rng)
-
+    walk = OdometryDriftOptions(scale=0.0, position_walk=WALK_M, frame="map")
+    scale = OdometryDriftOptions(frame="map")
     of_all = {"key_poses": {"readings": 2}}
     return DriveInMap(
         recording,
         given_sensors(made.truth, SIMULATED_UT),
         for_solvers(field_map),
-        drifted,
+        {
+            Drift.WALK: lambda truth, rng: drifting(truth, walk, world.noise, rng),
+            Drift.SLIP: lambda truth, rng: drifting(truth, scale, world.noise, rng),
+        },
         {
             Drift.WALK: SlamOptions.model_validate(of_all),
             Drift.SLIP: SlamOptions.model_validate({**of_all, "drift": SCALE}),
@@ -207,16 +207,6 @@ def scenario(seed: int, place: dict[str, object]) -> ScenarioOptions:
     """Return the options of a simulated place."""
     common = {"seed": seed, "noise": {"field": SIMULATED_UT}, "array": {"count": 12}}
     return ScenarioOptions.model_validate({**common, **place})
-
-
-def wheels(truth: Trajectory, drift: Drift, rng: np.random.Generator) -> Trajectory:
-    """Return odometry of wheels on an even floor."""
-    return slipping_on_floor(truth, rng) if drift is Drift.SLIP else walked(truth, rng)
-
-
-def carried(truth: Trajectory, drift: Drift, rng: np.random.Generator) -> Trajectory:
-    """Return odometry of what is carried about."""
-    return slipping(truth, rng) if drift is Drift.SLIP else walked(truth, rng)
 
 
 def strengths(

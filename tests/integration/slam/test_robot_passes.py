@@ -93,7 +93,7 @@ def test_in_the_map_of_the_others(
     """Odometry that slips by 1 %, and one that drifts as default options say."""
     expect(request, MISSED_IN_MAP.get((run, kind)))
     place = robot_in_map(shared_data, run)
-    odometry = place.drifted(place.truth, kind, np.random.default_rng(run))
+    odometry = place.drifted[kind](place.truth, np.random.default_rng(run))
     drive = place.with_odometry(odometry)
     found = localise(drive, place.field_map, place.calibration, place.options[kind], silent).result
     solved = Solved(run, kind, place.truth, found)
@@ -107,7 +107,7 @@ def test_in_the_map_of_the_others(
 def without_map(request: pytest.FixtureRequest, shared_data: Path) -> Solved:
     run, kind = request.param
     place = robot_in_map(shared_data, run)
-    odometry = place.drifted(place.truth, kind, np.random.default_rng(run))
+    odometry = place.drifted[kind](place.truth, np.random.default_rng(run))
     drive = replace(place.recording, trajectory=odometry)
     found = explore(drive, place.calibration, place.options[kind], silent).result
     return Solved(run, kind, place.truth, found)
