@@ -12,7 +12,6 @@ that a gyroscope on the sensor's own chip would measure, up to the noise of the 
 
 import os
 import subprocess
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,22 +25,6 @@ PYTHON_VARIABLE = "L2M_MAGYC_PYTHON"
 PYTHON = Path(".venv-magyc/bin/python")
 PROGRAM = Path(__file__).with_name("magyc_program.py")
 GAUSS = 100.0  # microtesla
-
-
-@dataclass(frozen=True)
-class ChipDrive:
-    """What a chip with a magnetometer and a gyroscope measured on a drive.
-
-    Attributes
-    ----------
-    readings
-        Of its magnetometer, with ``motion``.
-    R_mag_lidar
-        Rotation from the lidar to the chip, shape (3, 3): turns the lidar's rates into the chip's.
-    """
-
-    readings: Readings
-    R_mag_lidar: FloatArray
 
 
 @dataclass(frozen=True)
@@ -70,16 +53,15 @@ def magyc_python() -> Path:
     return python.absolute()
 
 
-def magyc_peer(drives: Sequence[ChipDrive], python: Path) -> tuple[FoundOffset, ...]:
-    """Return what magyc finds on each of some drives.
-
-    Loading it takes longer than a calibration, so that all drives go into one process. All
-    readings enter, for it differences them.
+def magyc_peer(readings: Readings, R_mag_lidar: FloatArray, python: Path) -> FoundOffset:
+    """Return what magyc finds on a drive; all readings enter, for it differences them.
 
     Parameters
     ----------
-    drives
-        What one chip measured on each.
+    readings
+        Of one magnetometer, with ``motion``.
+    R_mag_lidar
+        Rotation from the lidar to the chip, shape (3, 3): turns the lidar's rates into the chip's.
     python
         Of the environment of magyc.
 
@@ -88,26 +70,20 @@ def magyc_peer(drives: Sequence[ChipDrive], python: Path) -> tuple[FoundOffset, 
     PeerError
         Readings without motion, or a program that cannot be run.
     """
+    if readings.motion is None:
+        raise PeerError("magyc needs turn rates: the readings have no motion")
     with TemporaryDirectory() as folder:
-        source, target = Path(folder, "drives.npz"), Path(folder, "results.npz")
-        np.savez(source, allow_pickle=False, **_arrays(drives))
+        source, target = Path(folder, "drive.npz"), Path(folder, "result.npz")
+        np.savez(
+            source,
+            allow_pickle=False,
+            field=readings.field / GAUSS,
+            rate=readings.motion.twist_lidar[:, :3] @ R_mag_lidar.T,
+            time=(readings.stamp_ns - readings.stamp_ns[:1]) * 1e-9,
+        )
         _run(python, source, target)
-        with np.load(target) as results:
-            columns = [results[name] for name in ("hard_iron", "soft_iron", "seconds")]
-    return tuple(_estimate(*row) for row in zip(*columns, strict=True))
-
-
-def _arrays(drives: Sequence[ChipDrive]) -> dict[str, FloatArray]:
-    """Return what the program reads: gauss, rad/s and seconds."""
-    arrays = {"count": np.array(float(len(drives)))}
-    for index, each in enumerate(drives):
-        readings, motion = each.readings, each.readings.motion
-        if motion is None:
-            raise PeerError(f"magyc needs turn rates: the readings of drive {index} have no motion")
-        arrays[f"field_{index}"] = readings.field / GAUSS
-        arrays[f"rate_{index}"] = motion.twist_lidar[:, :3] @ each.R_mag_lidar.T
-        arrays[f"time_{index}"] = (readings.stamp_ns - readings.stamp_ns[:1]) * 1e-9
-    return arrays
+        with np.load(target) as result:
+            return FoundOffset(result["hard_iron"] * GAUSS, float(result["seconds"]))
 
 
 def _run(python: Path, source: Path, target: Path) -> None:
@@ -117,9 +93,3 @@ def _run(python: Path, source: Path, target: Path) -> None:
     if done.returncode or not target.exists():
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise PeerError(f"magyc does not run in {python}: {last}; make its environment anew")
-
-
-def _estimate(hard_iron: FloatArray, soft_iron: FloatArray, seconds: float) -> FoundOffset:
-    """Return a result in microtesla."""
-    found = np.isfinite([*hard_iron, *soft_iron.ravel()]).all()
-    return FoundOffset(hard_iron * GAUSS if found else np.full(3, np.nan), float(seconds))

@@ -9,7 +9,7 @@ from scipy.linalg import polar
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
-from l2m_gtsam.studies.magyc_peer import ChipDrive, magyc_peer, magyc_python
+from l2m_gtsam.studies.magyc_peer import magyc_peer, magyc_python
 from l2m_gtsam.studies.methods import MethodResult, as_published, two_step
 
 OURS, NAIVE, MAGYC = "one-key", "naive peer", "magyc"
@@ -54,6 +54,5 @@ def magyc(readings: Readings, C: FloatArray) -> MethodResult:
     PeerError
         It has no environment, or fails.
     """
-    R_mag_lidar = np.asarray(polar(C)[0])
-    (found,) = magyc_peer([ChipDrive(readings, R_mag_lidar)], magyc_python())
+    found = magyc_peer(readings, np.asarray(polar(C)[0]), magyc_python())
     return MethodResult(np.append(np.full(12, np.nan), found.H)[None], 1, found.seconds)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, LidarMotion, Readings
 from l2m_gtsam.errors import MapError, PeerError
-from l2m_gtsam.studies.magyc_peer import ChipDrive, magyc_peer, magyc_python
+from l2m_gtsam.studies.magyc_peer import magyc_peer, magyc_python
 from l2m_gtsam.studies.naive_peer import NaiveOptions, naive_map, naive_peer
 from tests.worlds.exact import DipoleWorld, drive, random_sensors
 
@@ -36,8 +36,11 @@ def survey(world: DipoleWorld, count: int = 500) -> tuple[FloatArray, FloatArray
     return points, field + rng.normal(0, NOISE, field.shape)
 
 
-def turning(seed: int, sensor: KnownSensor, rate: float = 20.0) -> ChipDrive:
-    """A minute of turning through all attitudes at one place, in a uniform field."""
+def turning(seed: int, sensor: KnownSensor, rate: float = 20.0) -> tuple[Readings, FloatArray]:
+    """A minute of turning through all attitudes at one place, in a uniform field.
+
+    And the rotation from the lidar to the sensor.
+    """
     rng = np.random.default_rng(seed)
     seconds = np.arange(int(60 * rate)) / rate
     now, before, after = (attitude_at(seconds + shift) for shift in (0.0, -1e-4, 1e-4))
@@ -54,7 +57,7 @@ def turning(seed: int, sensor: KnownSensor, rate: float = 20.0) -> ChipDrive:
         field + rng.normal(0, NOISE, field.shape),
         LidarMotion.steady(np.column_stack([turn_rate, np.zeros((count, 3))])),
     )
-    return ChipDrive(readings, polar(sensor.distortion.C)[0])
+    return readings, polar(sensor.distortion.C)[0]
 
 
 def attitude_at(seconds: FloatArray) -> Rotation:
@@ -116,8 +119,8 @@ def python_of_magyc(repository: Path) -> Path:
 
 def test_magyc_finds_the_offset_in_a_uniform_field(python_of_magyc: Path) -> None:
     sensors = random_sensors(5, 3)
-    drives = [turning(seed, sensor) for seed, sensor in enumerate(sensors)]
-    for sensor, found in zip(sensors, magyc_peer(drives, python_of_magyc), strict=True):
+    for seed, sensor in enumerate(sensors):
+        found = magyc_peer(*turning(seed, sensor), python_of_magyc)
         # It differences readings backwards, so that its rates are half of 50 ms late: at 0.8 rad/s
         # 2 % of 44 uT, 0.8 uT, in directions that turn. A quarter of it is left for what stays.
         np.testing.assert_allclose(found.H, sensor.distortion.H, rtol=0, atol=0.2)
@@ -125,25 +128,22 @@ def test_magyc_finds_the_offset_in_a_uniform_field(python_of_magyc: Path) -> Non
 
 
 def test_magyc_without_a_result_says_nan(python_of_magyc: Path) -> None:
-    good = turning(0, random_sensors(5, 1)[0])
-    readings = replace(good.readings, field=np.full_like(good.readings.field, np.nan))
-    nothing, found = magyc_peer([replace(good, readings=readings), good], python_of_magyc)
-    assert np.isnan(nothing.H).all()
-    assert np.isfinite(found.H).all()
+    readings, R_mag_lidar = turning(0, random_sensors(5, 1)[0])
+    nothing = replace(readings, field=np.full_like(readings.field, np.nan))
+    assert np.isnan(magyc_peer(nothing, R_mag_lidar, python_of_magyc).H).all()
 
 
 def test_readings_without_motion_are_one_line() -> None:
-    chip = turning(0, random_sensors(5, 1)[0], rate=1.0)
-    still = replace(chip, readings=replace(chip.readings, motion=None))
-    with pytest.raises(PeerError, match=r"^magyc needs turn rates: .* drive 0 have no motion$"):
-        magyc_peer([still], Path(sys.executable))
+    readings, R_mag_lidar = turning(0, random_sensors(5, 1)[0], rate=1.0)
+    with pytest.raises(PeerError, match=r"^magyc needs turn rates: the readings have no motion$"):
+        magyc_peer(replace(readings, motion=None), R_mag_lidar, Path(sys.executable))
 
 
 def test_an_environment_without_magyc_is_one_line() -> None:
     chip = turning(0, random_sensors(5, 1)[0], rate=1.0)
     # The environment of the tests is one: magyc cannot be installed beside what we need.
     with pytest.raises(PeerError, match=r"^magyc does not run .* No module named 'magyc'; .*$"):
-        magyc_peer([chip], Path(sys.executable))
+        magyc_peer(*chip, Path(sys.executable))
 
 
 def test_no_environment_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
