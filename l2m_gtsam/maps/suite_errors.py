@@ -113,9 +113,12 @@ class SuiteErrors:
         )
 
     def as_sure_as(self, other: "SuiteErrors") -> "SuiteErrors | None":
-        """Return the same with the covariance of others; None unless they are the same sensors."""
-        same = self.sensors == other.sensors
-        return replace(self, covariance=other.covariance) if same else None
+        """Return the same with the covariance of others; None unless they are the same sensors.
+
+        It is the one that was stated: nothing that was found is taken off these readings yet.
+        """
+        stated = other.covariance if other.found is None else other.found.stated
+        return replace(self, covariance=stated) if self.sensors == other.sensors else None
 
     def as_found_by(self, other: "SuiteErrors | None") -> "SuiteErrors":
         """Return the same with what others found of the same sensors, stated to be as accurate."""

@@ -285,6 +285,17 @@ def test_later_readings_are_corrected_alike(found: HarmonicMap, wrong_by: FloatA
     assert strange.as_found_by(one) is strange
 
 
+def test_later_readings_that_nothing_is_stated_of_are_corrected_too(found: HarmonicMap) -> None:
+    points, field = readings(50, seed=4)
+    stated = independent(len(points))
+    silent = replace(stated, covariance=0 * stated.covariance)
+    one, other = (found.updated(points, field, each).learnt for each in (stated, silent))
+    np.testing.assert_array_equal(other.readings.field, one.readings.field)
+    assert one.suite is not None
+    assert other.suite is not None
+    np.testing.assert_array_equal(other.suite.covariance, one.suite.covariance)
+
+
 def test_a_map_keeps_what_was_found(found: HarmonicMap) -> None:
     again = map_from_state(found.to_state())
     assert isinstance(again, HarmonicMap)
