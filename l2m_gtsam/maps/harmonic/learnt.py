@@ -228,7 +228,7 @@ class Learnt:
         ``suite`` and ``poses`` are what errors of their sensors and poses do to the new readings.
         """
         if self.history is not None:  # readings of two drives are not averaged: see ``followed_by``
-            return self.followed_by(new, options, suite, UNDATED)
+            return self.followed_by(new, options, suite, UNDATED, poses)
         new, suite = self.as_found(new, suite)
         together = joined(self.readings, new)
         owner = cubes_of(together.points, options.merge)
@@ -238,11 +238,16 @@ class Learnt:
         if wrong_poses is not None:
             wrong_poses = wrong_poses.averaged(owner, together.weight)
         readings = merged(together, options.merge, options.independent)
-        learnt = self._of(readings, errors, together, len(new), options)
+        learnt = self._of(readings, errors, survey_doubts(together), len(new), options)
         return replace(learnt, poses=wrong_poses)
 
     def followed_by(
-        self, new: TrainingSet, options: HarmonicOptions, suite: SuiteErrors | None, drive: MapDrive
+        self,
+        new: TrainingSet,
+        options: HarmonicOptions,
+        suite: SuiteErrors | None,
+        drive: MapDrive,
+        poses: SurveyPoses | None = None,
     ) -> "Learnt":
         """Return the same with the readings of a new drive, which stay apart from earlier ones.
 
@@ -256,16 +261,21 @@ class Learnt:
             What errors of their sensors do to them.
         drive
             When it was.
+        poses
+            What errors of their poses do to them.
         """
         new, suite = self.as_found(new, suite)
         owner = cubes_of(new.points, options.merge)
         own = None if suite is None else suite.averaged(owner, new.weight)
         errors = errors_together(self.suite, own, len(self.readings))
+        own_poses = None if poses is None else poses.averaged(owner, new.weight)
+        wrong_poses = errors_together(self.poses, own_poses, len(self.readings))
         added = merged(new, options.merge, options.independent)
         together = joined(self.readings, added)
         # Steel that came between two drives is no fault of a survey: each is doubted by itself.
-        learnt = self._of(together, errors, new, len(new), options)
-        return replace(learnt, history=self.past.followed_by(len(added), drive))
+        learnt = self._of(together, errors, survey_doubts(new), len(new), options)
+        history = self.past.followed_by(len(added), drive)
+        return replace(learnt, history=history, poses=wrong_poses)
 
     def as_found(
         self, new: TrainingSet, suite: SuiteErrors | None
@@ -282,20 +292,19 @@ class Learnt:
         suite = None if self.suite is None else self.suite.only(keep)
         poses = None if self.poses is None else self.poses.only(keep)
         history = None if self.history is None else self.history.only(keep)
-        readings = self.readings[rows]
-        learnt = self._of(readings, suite, readings, 0, options)
+        learnt = self._of(self.readings[rows], suite, (), 0, options)
         return replace(learnt, history=history, poses=poses)
 
     def _of(
         self,
         readings: TrainingSet,
         suite: SuiteErrors | None,
-        seen: TrainingSet,
+        doubts: tuple[str, ...],
         added: int,
         options: HarmonicOptions,
     ) -> "Learnt":
         """Return the same prior over other readings, with their tiles; see ``extended``."""
-        survey = tuple(dict.fromkeys((*self.origin.survey, *survey_doubts(seen))))
+        survey = tuple(dict.fromkeys((*self.origin.survey, *doubts)))
         grid = self.tiling.grid
         wider = grid_from(grid.origin, readings.points, grid.size, reach_of(grid.size, options))
         return replace(

@@ -8,8 +8,13 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.bilinear.bilinear_map import BilinearMap
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map, map_from_state
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
+from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.maps.hyperparameters import KernelHyperparameters
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
+from l2m_gtsam.maps.training import additional_set
+from l2m_gtsam.records.map_diary import UNDATED
 from tests.worlds.exact import dipole_world
 from tests.worlds.quick_maps import QUICK_HARMONIC, quick
 
@@ -122,3 +127,15 @@ def test_bad_readings_are_refused(kind: str) -> None:
     field[700, 1] = np.nan
     with pytest.raises(MapError, match="training reading 200 of 500 is not finite"):
         old.updated(points[NEW], field[NEW])
+
+
+def test_steel_between_two_drives_is_no_doubt_where_readings_are_left_out() -> None:
+    rng, options = np.random.default_rng(0), HarmonicOptions(hyperparameters=Hyperparameters())
+    options = options.model_copy(update={"search": SearchOptions(rounds=0)})
+    points = np.column_stack([rng.uniform(0, 2, (400, 2)), np.full(400, 0.4)])
+    field = np.array([15.0, 8.0, 40.0]) + rng.normal(0, 0.1, (400, 3))
+    learnt = HarmonicMap.fit(points, field, options).learnt
+    steel = additional_set(points, field + np.array([0, 0, 15]))
+    learnt = learnt.followed_by(steel, options, None, UNDATED)
+    keep = np.arange(len(learnt.readings)) > 0
+    assert learnt.only(keep, options).origin.survey == learnt.origin.survey == ()

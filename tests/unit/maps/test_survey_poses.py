@@ -13,6 +13,7 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic.evidence import SharedNoise, condition, evidence, normal_of
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.history import History
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.pose_sizes import MOST_READINGS, pose_view
 from l2m_gtsam.maps.harmonic.search import SearchOptions
@@ -21,6 +22,7 @@ from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.maps.survey_poses import KNOTS, SurveyPoses
 from l2m_gtsam.maps.training import TrainingSet, cubes_of, errors_together
+from l2m_gtsam.records.map_diary import UNDATED
 from tests.worlds.exact import DipoleWorld, dipole_world
 from tests.worlds.harmonic import GIVEN, basis, places, rms
 
@@ -326,6 +328,20 @@ def test_more_readings_keep_the_errors_of_the_old_ones(posed: HarmonicMap) -> No
     unknown = posed.updated(points, field, None, replace(first, stated=False)).learnt.poses
     assert unknown is not None
     assert len(unknown.reading) == len(posed.learnt.poses.reading)
+
+
+def test_a_map_that_is_kept_up_counts_the_errors_of_new_poses(posed: HarmonicMap) -> None:
+    learnt = posed.learnt
+    history = History.of_survey(len(learnt.readings), UNDATED)
+    kept = HarmonicMap.condition(replace(learnt, history=history), NO_SEARCH)
+    points, field = posed.readings.points[:40] + np.array([0, 0.3, 0]), posed.readings.field[:40]
+    first = replace(errors(40), shift=1e-3 * errors(40).shift)
+    more = kept.updated(points, field, None, first).learnt.poses
+    assert learnt.poses is not None
+    assert more is not None
+    assert len(more.reading) == len(learnt.poses.reading) + 40
+    # Readings of two drives stay apart: the new ones are numbered after all of the old ones.
+    assert more.reading[-40:].min() == len(learnt.readings)
 
 
 def test_readings_with_exact_poses_may_be_where_no_others_are(posed: HarmonicMap) -> None:
