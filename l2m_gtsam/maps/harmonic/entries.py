@@ -52,7 +52,7 @@ def _checked(arrays: Arrays, name: str, shape: Shape, dtype: np.dtype[Any]) -> n
     return found
 
 
-ALGORITHM = 3
+ALGORITHM = 4
 """To be raised with every change to what is solved, compiled or kept of the same readings."""
 
 

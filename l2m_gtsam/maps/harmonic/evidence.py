@@ -16,11 +16,13 @@ to the readings, the noise has the covariance
     N = \sigma^2 W^{-1} + E E^T, \qquad
     \sigma^2 N^{-1} = W - U^T U, \quad U = K_E^{-1} E^T W / \sigma, \quad
     K_E K_E^T = 1 + E^T W E / \sigma^2
+
+In the sums such errors are weights like others, which are integrated out.
 """
 
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -63,29 +65,14 @@ class SharedNoise:
         inner[np.diag_indices_from(inner)] += 1.0
         return np.asarray(cholesky(inner, lower=True, check_finite=False))
 
-    @property
-    def log_determinant(self) -> float:
-        """Of ``N``, beyond that of the white part."""
-        return 2 * float(np.log(np.diag(self.root)).sum())
-
-    def rows(self, at: slice, weighted: FloatArray) -> FloatArray:
-        """Return ``E^T`` of some readings times what is weighted by W, (n, 3, k): shape (q, k)."""
-        E = self.errors[at].reshape(-1, self.errors.shape[2])
-        return np.asarray(E.T @ weighted.reshape(len(E), -1))
-
-    def taken(self, crossed: FloatArray) -> FloatArray:
-        """Return ``U X`` of ``E^T W X``, both of shape (q, k)."""
-        return np.asarray(
-            solve_triangular(self.root, crossed / self.noise, lower=True, check_finite=False)
-        )
-
     def given(self, values: FloatArray) -> FloatArray:
         """Return ``sigma^2 N^-1 X`` for X, both of shape (n, 3, k)."""
         weighted = values * self.weight[:, None, None]
-        taken = self.taken(self.rows(slice(None), weighted))
-        back = solve_triangular(self.root, taken, lower=True, trans=1, check_finite=False)
         E = self.errors.reshape(-1, self.errors.shape[2])
-        shared = (E @ back).reshape(values.shape) / self.noise
+        crossed = E.T @ weighted.reshape(len(E), -1) / self.noise**2
+        shared = (E @ cho_solve((self.root, True), crossed, check_finite=False)).reshape(
+            values.shape
+        )
         return np.asarray(weighted - shared * self.weight[:, None, None])
 
 
@@ -129,39 +116,36 @@ def normal_of(basis: Basis, readings: TrainingSet, shared: SharedNoise | None = 
 
     What they share of their noise is taken out: the sums are then those for its noise alone.
     """
-    m = len(basis)
-    FF, Fy, yy = np.zeros((m, m)), np.zeros(m), 0.0
-    crossed = None if shared is None else np.zeros((shared.errors.shape[2], m + 1))
+    m, q = len(basis), 0 if shared is None else shared.errors.shape[2]
+    FF, Fy, yy = np.zeros((m + q, m + q)), np.zeros(m + q), 0.0
     for at in batches(len(readings)):
         root = np.sqrt(readings.weight[at])
         F = basis.features(readings.points[at])
+        if shared is not None:  # errors are weights, too, of unit variance
+            F = np.concatenate([F, shared.errors[at]], axis=2)
         F *= root[:, None, None]
-        F = F.reshape(-1, m)
+        F = F.reshape(-1, m + q)
         y = (readings.field[at] * root[:, None]).ravel()
         FF += F.T @ F
         Fy += F.T @ y
         yy += float(y @ y)
-        if shared is not None and crossed is not None:
-            white = np.column_stack([F, y]) * np.repeat(root, 3)[:, None]
-            crossed += shared.rows(at, white)
     log_weight = 3 * float(np.log(readings.weight).sum())
-    if shared is not None and crossed is not None:
-        taken = shared.taken(crossed)
-        lost = taken.T @ taken
-        FF, Fy, yy = FF - lost[:-1, :-1], Fy - lost[:-1, -1], yy - float(lost[-1, -1])
-        log_weight -= shared.log_determinant
-    return Normal(FF, Fy, yy, 3 * len(readings), log_weight)
+    whole = Normal(FF, Fy, yy, 3 * len(readings), log_weight)
+    if shared is None:
+        return whole
+    return marginalised(whole, np.arange(m), np.zeros(m + q), shared.noise)
 
 
 def marginalised(normal: Normal, kept: IntArray, log_variance: FloatArray, noise: float) -> Normal:
     """Return the sums for some weights alone, the others integrated out under their prior.
 
-    Evidence of the kept weights' prior is the same but for a constant.
+    Evidence of the kept weights' prior is the same.
 
     Parameters
     ----------
     normal
-        Sums over the readings, for m weights.
+        Sums over the readings, for m weights; ``Fy`` may have columns, shape (m,) or (m, c), of
+        which ``yy`` is that of the first.
     kept
         Columns of the weights that stay, shape (k,).
     log_variance, noise
@@ -171,20 +155,21 @@ def marginalised(normal: Normal, kept: IntArray, log_variance: FloatArray, noise
     others[kept] = False
     gone = np.flatnonzero(others)
     D = np.exp(0.5 * log_variance[gone])
-    part = Normal(submatrix(normal.FF, gone), normal.Fy[gone], normal.yy, 0, 0.0)
+    part = replace(normal, FF=submatrix(normal.FF, gone))
     K = whitened_factor(part, D, noise)
-    right = np.empty((len(gone), len(kept) + 1), order="F")
-    right[:, :-1], right[:, -1] = normal.FF[np.ix_(kept, gone)].T, normal.Fy[gone]
+    columns, k = normal.Fy.reshape(len(others), -1), len(kept)
+    right = np.empty((len(gone), k + columns.shape[1]), order="F")
+    right[:, :k], right[:, k:] = normal.FF[np.ix_(kept, gone)].T, columns[gone]
     right *= (D / noise)[:, None]
     half = solve_triangular(K, right, lower=True, overwrite_b=True, check_finite=False)
     # Schur complement of the block that is integrated out.
     known = half.T @ half
     return Normal(
-        submatrix(normal.FF, kept) - known[:-1, :-1],
-        normal.Fy[kept] - known[:-1, -1],
-        normal.yy - float(known[-1, -1]),
+        submatrix(normal.FF, kept) - known[:k, :k],
+        normal.Fy[kept] - known[:k, k:].reshape(k, *normal.Fy.shape[1:]),
+        normal.yy - float(known[k, k]),
         normal.rows,
-        normal.log_weight,
+        normal.log_weight - 2 * float(np.log(np.diag(K)).sum()),
     )
 
 

@@ -206,6 +206,7 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
     noise, prior = hyperparameters.noise, basis.prior(hyperparameters).log_variance
     # Floor, ceiling and uniform field stay as they are: integrated out once, not at each step.
     alone, given = marginalised(normal, kept, prior, noise), prior[kept]
+    alone = replace(alone, log_weight=normal.log_weight)  # the search ends by shares of it
     start = np.log([strength for _, strength in structures])
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:

@@ -13,16 +13,21 @@ nothing is forgotten by its age.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
-from l2m_gtsam.maps.harmonic.evidence import Normal, SharedNoise, evidence, normal_of
+from l2m_gtsam.maps.harmonic.evidence import (
+    Normal,
+    SharedNoise,
+    evidence,
+    marginalised,
+    normal_of,
+)
 from l2m_gtsam.maps.harmonic.family import UniformField
 from l2m_gtsam.maps.harmonic.history import STILL, TileStep
 from l2m_gtsam.maps.harmonic.learnt import Learnt
@@ -211,23 +216,7 @@ def prior_sigma(learnt: Learnt, basis: Basis) -> FloatArray:
     return np.asarray(np.exp(0.5 * basis.prior(learnt.hyperparameters).log_variance))
 
 
-@dataclass(frozen=True)
-class Faded:
-    """Sums over earlier readings for the weights as they are after a step.
-
-    Attributes
-    ----------
-    normal
-        The sums.
-    log_det
-        Logarithm of the determinant that belongs to their likelihood.
-    """
-
-    normal: Normal
-    log_det: float
-
-
-def faded(normal: Normal, prior_sigma: FloatArray, noise: float, moved: FloatArray) -> Faded:
+def faded(normal: Normal, prior_sigma: FloatArray, noise: float, moved: FloatArray) -> Normal:
     """Return the sums over readings after a step of the weights.
 
     Parameters
@@ -241,27 +230,15 @@ def faded(normal: Normal, prior_sigma: FloatArray, noise: float, moved: FloatArr
     moved
         rho of each weight, 0 to 1, shape (m,).
     """
-    if not moved.any():
-        return Faded(normal, 0.0)
-    free = np.flatnonzero(moved)
-    root = prior_sigma[free] * moved[free] / noise
-    A = normal.FF[np.ix_(free, free)] * (root[:, None] * root)
-    A[np.diag_indices_from(A)] += 1.0
-    K = cholesky(A, lower=True, check_finite=False)
-    m = len(moved)
-    columns = normal.Fy.reshape(m, -1)
-    right = np.hstack([normal.FF[free], columns[free]]) * root[:, None]
-    half = solve_triangular(K, right, lower=True, check_finite=False)
-    known = half[:, :m].T @ half
-    first, alike = half[:, m], np.sqrt(1 - moved**2)
-    after = Normal(
-        (normal.FF - known[:, :m]) * (alike[:, None] * alike),
-        ((columns - known[:, m:]) * alike[:, None]).reshape(normal.Fy.shape),
-        normal.yy - float(first @ first),
-        normal.rows,
-        normal.log_weight,
-    )
-    return Faded(after, 2 * float(np.log(np.diag(K)).sum()))
+    free, m = np.flatnonzero(moved), len(moved)
+    if not len(free):
+        return normal
+    # Beside the weights as they are now, xi of those that moved.
+    at = np.append(np.arange(m), free)
+    scale = np.append(np.sqrt(1 - moved**2), moved[free])
+    FF, Fy = normal.FF[np.ix_(at, at)] * (scale[:, None] * scale), (normal.Fy[at].T * scale).T
+    both = replace(normal, FF=FF, Fy=Fy)
+    return marginalised(both, np.arange(m), 2 * np.log(prior_sigma[at]), noise)
 
 
 def carried(
@@ -280,7 +257,7 @@ def carried(
     """
     total = normals[0]
     for normal, each in zip(normals[1:], moved, strict=True):
-        total = faded(total, prior_sigma, noise, each).normal + normal
+        total = faded(total, prior_sigma, noise, each) + normal
     return total
 
 
@@ -301,7 +278,7 @@ def likelihood(
         rho of each weight, shape (m,).
     """
     old = faded(before, np.exp(0.5 * log_variance), noise, moved)
-    return evidence(old.normal + new, log_variance, noise).value - 0.5 * old.log_det
+    return evidence(old + new, log_variance, noise).value
 
 
 def share_left(normal: Normal, prior_sigma: FloatArray, noise: float, moved: FloatArray) -> float:
@@ -310,7 +287,7 @@ def share_left(normal: Normal, prior_sigma: FloatArray, noise: float, moved: Flo
     The mean over the weights that the readings know better than the prior.
     """
     gain = np.maximum(np.diag(normal.FF), 0.0) * (prior_sigma / noise) ** 2
-    after = np.maximum(np.diag(faded(normal, prior_sigma, noise, moved).normal.FF), 0.0)
+    after = np.maximum(np.diag(faded(normal, prior_sigma, noise, moved).FF), 0.0)
     known = gain > 1
     left = after[known] * (prior_sigma[known] / noise) ** 2 / gain[known]
     return float(np.clip(np.mean(left), 0.0, 1.0)) if known.any() else 1.0
