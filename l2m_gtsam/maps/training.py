@@ -209,13 +209,18 @@ def merged(readings: TrainingSet, edge: float, independent: int) -> TrainingSet:
     independent
         The most that the readings of one cube are worth.
     """
-    owner = cubes_of(readings.points, edge)
+    means = group_means(readings, cubes_of(readings.points, edge))
     # Weighted means are what all readings of a cube are worth together where the field is linear
     # in it; beyond ``independent`` they share errors that no average removes.
+    return replace(means, weight=np.minimum(means.weight, independent))
+
+
+def group_means(readings: TrainingSet, owner: IntArray) -> TrainingSet:
+    """Return the mean of each group of N readings, (N,), worth as much as these together."""
     worth = np.bincount(owner, readings.weight)
     columns = (np.hstack([readings.points, readings.field]) * readings.weight[:, None]).T
     means = np.column_stack([np.bincount(owner, column) for column in columns]) / worth[:, None]
-    return TrainingSet(means[:, :3], means[:, 3:], np.minimum(worth, independent))
+    return TrainingSet(means[:, :3], means[:, 3:], np.asarray(worth))
 
 
 def cubes_of(points: FloatArray, edge: float) -> IntArray:

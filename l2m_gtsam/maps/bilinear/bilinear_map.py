@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FieldAndGradient, FieldSample, FloatArray, MapState
 from l2m_gtsam.errors import MapError
@@ -45,8 +44,8 @@ class BilinearMap:
 
     Attributes
     ----------
-    cells
-        Averages of the readings: M cells, map frame, metres and uT.
+    readings
+        Averaged over cells, map frame, metres and uT.
     options
         Options of the grid, lengths in metres.
     lattice
@@ -58,7 +57,7 @@ class BilinearMap:
     """
 
     kind: ClassVar[str] = "bilinear"
-    cells: Cells
+    readings: Cells
     options: BilinearOptions
     lattice: Lattice
     spread: float
@@ -107,17 +106,12 @@ class BilinearMap:
         return cls(cells, options, lattice_over(cells, options), float(spread[0]))
 
     @property
-    def readings(self) -> TrainingSet:
-        """Readings in the map frame, averaged over cells."""
-        return TrainingSet(self.cells.points, self.cells.field, self.cells.count)
-
-    @property
     def summary(self) -> MapSummary:
         """Figures of the map."""
-        heights, points = self.cells.heights, self.cells.points
+        heights, points = self.readings.heights, self.readings.points
         return MapSummary(
             kind=self.kind,
-            readings=int(self.cells.count.sum()),
+            readings=int(self.readings.weight.sum()),
             rows=len(points),
             lower=points.min(axis=0),
             upper=points.max(axis=0),
@@ -133,7 +127,7 @@ class BilinearMap:
         """Return field, gradient and variance; see ``FieldMap``."""
         points = checked_points(points)
         field, gradient = self.field_and_gradient(points)
-        away, _ = cKDTree(self.cells.points).query(points)
+        away, _ = self.readings.tree.query(points)
         inside = np.asarray(away <= self.options.reach)
         return masked(FieldSample(field, gradient, self.variance(points), inside))
 
@@ -161,7 +155,7 @@ class BilinearMap:
         squares = 3 * float(old.weight.sum()) * self.spread
         squares += squares_about(lattice, old) - squares_about(self.lattice, old)
         squares = max(squares, 0.0) + squares_about(lattice, new)
-        spread = squares / (3 * float(cells.count.sum()))
+        spread = squares / (3 * float(cells.weight.sum()))
         return BilinearMap(cells, self.options, lattice, spread, self.frame)
 
     def in_frame(self, frame: str | None, /) -> "BilinearMap":
@@ -170,7 +164,9 @@ class BilinearMap:
 
     def to_state(self) -> MapState:
         """Return the map as its averages: the nodes are filled again from them."""
-        arrays = {**vars(self.cells), "spread": np.array([self.spread])}
+        own = self.readings
+        arrays = {"points": own.points, "field": own.field, "count": own.weight, "layer": own.layer}
+        arrays["spread"] = np.array([self.spread])
         return MapState(self.kind, arrays, self.options.model_dump(mode="json"), {})
 
 

@@ -1,16 +1,17 @@
 """Readings averaged over square cells in layers of one height, and the field between nodes."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from pydantic import Field
-from scipy.interpolate import LinearNDInterpolator
+from scipy.interpolate import LinearNDInterpolator, NdBSpline
 from scipy.spatial import QhullError, cKDTree
 
 from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.trained import state_array
-from l2m_gtsam.maps.training import FURTHEST, TrainingSet, checked_points
+from l2m_gtsam.maps.training import FURTHEST, TrainingSet, checked_points, group_means
 from l2m_gtsam.options import Options
 
 MOST_NODES = 5_000_000  # their values take 120 MB
@@ -34,30 +35,21 @@ class BilinearOptions(Options):
 
 
 @dataclass(frozen=True)
-class Cells:
-    """The averages of all cells that hold a reading.
+class Cells(TrainingSet):
+    """The averages of all M cells that hold a reading; each weighs as much as its readings.
 
     Attributes
     ----------
-    points
-        Mean positions in metres, shape (M, 3).
-    field
-        Mean readings in microtesla, shape (M, 3).
-    count
-        Readings of each, shape (M,).
     layer
         Layer of each, counted from the lowest, shape (M,).
     """
 
-    points: FloatArray
-    field: FloatArray
-    count: FloatArray
     layer: IntArray
 
     @property
     def heights(self) -> FloatArray:
         """Mean height of the readings of each layer in metres, ascending, shape (L,)."""
-        return mean_of_groups(self.layer, self.points[:, 2], self.count)
+        return mean_of_groups(self.layer, self.points[:, 2], self.weight)
 
 
 def mean_of_groups(group: IntArray, values: FloatArray, weight: FloatArray) -> FloatArray:
@@ -70,14 +62,7 @@ def averaged(readings: TrainingSet, options: BilinearOptions) -> Cells:
     layer = layers_of(readings.points[:, 2], readings.weight, options.layer)
     squares = np.rint(readings.points[:, :2] / options.spacing).astype(np.int64)
     keys, owner = np.unique(np.column_stack([layer, squares]), axis=0, return_inverse=True)
-    columns = np.hstack([readings.points, readings.field]).T
-    means = [mean_of_groups(owner, column, readings.weight) for column in columns]
-    return Cells(
-        points=np.column_stack(means[:3]),
-        field=np.column_stack(means[3:]),
-        count=np.asarray(np.bincount(owner, readings.weight)),
-        layer=keys[:, 0],
-    )
+    return Cells(**vars(group_means(readings, owner)), layer=keys[:, 0])
 
 
 def layers_of(heights: FloatArray, weight: FloatArray, layer: float) -> IntArray:
@@ -127,25 +112,6 @@ def cells_from_state(state: MapState, options: BilinearOptions) -> Cells:
 
 
 @dataclass(frozen=True)
-class Knots:
-    """The two nodes around each point along one axis.
-
-    Attributes
-    ----------
-    node
-        Their indices, shape (N, 2).
-    weight
-        Their shares, which add up to one, shape (N, 2).
-    slope
-        Derivatives of the shares in 1/m, shape (N, 2): zero where the point was clamped.
-    """
-
-    node: IntArray
-    weight: FloatArray
-    slope: FloatArray
-
-
-@dataclass(frozen=True)
 class Lattice:
     """Values on the nodes of a box.
 
@@ -160,44 +126,21 @@ class Lattice:
     axes: tuple[FloatArray, FloatArray, FloatArray]
     values: FloatArray
 
+    @cached_property
+    def _spline(self) -> NdBSpline:
+        ends = (np.concatenate([axis[:1], axis, axis[-1:]]) for axis in self.axes)
+        return NdBSpline(tuple(ends), self.values, 1)
+
     def field_and_gradient(self, points: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and its exact gradient (N, 3, 3) in uT/m.
 
         Points outside of the box, in metres, shape (N, 3), take the value of its nearest point.
         """
-        x, y, z = (knots(axis, at) for axis, at in zip(self.axes, points.T, strict=True))
-        corners = self.values[
-            x.node[:, :, None, None], y.node[:, None, :, None], z.node[:, None, None, :]
-        ]
-        field = contracted(corners, x.weight, y.weight, z.weight)
-        gradient = [
-            contracted(corners, x.slope, y.weight, z.weight),
-            contracted(corners, x.weight, y.slope, z.weight),
-            contracted(corners, x.weight, y.weight, z.slope),
-        ]
-        return field, np.stack(gradient, axis=2)
-
-
-def knots(axis: FloatArray, at: FloatArray) -> Knots:
-    """Return the nodes of an axis, shape (K,), around coordinates, shape (N,), both in metres."""
-    low = np.clip(np.searchsorted(axis, at, side="right") - 1, 0, len(axis) - 2)
-    step = axis[low + 1] - axis[low]
-    share = (np.clip(at, axis[0], axis[-1]) - axis[low]) / step
-    slope = np.where((at < axis[0]) | (at > axis[-1]), 0.0, 1 / step)
-    return Knots(
-        np.column_stack([low, low + 1]),
-        np.column_stack([1 - share, share]),
-        np.column_stack([-slope, slope]),
-    )
-
-
-def contracted(
-    corners: FloatArray, along_x: FloatArray, along_y: FloatArray, along_z: FloatArray
-) -> FloatArray:
-    """Return the sum over the corners, shape (N, 2, 2, 2, 3), times weights (N, 2) per axis."""
-    plane = np.einsum("nabci,nc->nabi", corners, along_z)
-    line = np.einsum("nabi,nb->nai", plane, along_y)
-    return np.asarray(np.einsum("nai,na->ni", line, along_x))
+        low, high = ([axis[end] for axis in self.axes] for end in (0, -1))
+        inside = np.clip(points, low, high)
+        slopes = [self._spline(inside, nu=axis) for axis in np.eye(3, dtype=np.int64)]
+        gradient = np.stack(slopes, axis=2) * (inside == points)[:, None]
+        return self._spline(inside), gradient
 
 
 def lattice_over(cells: Cells, options: BilinearOptions) -> Lattice:
@@ -247,7 +190,7 @@ def layer_values(
     """
     own = cells.layer == layer
     centre, field = cells.points[own, :2], cells.field[own]
-    _, nearest = cKDTree(cells.points).query(
+    _, nearest = cells.tree.query(
         np.column_stack([plane, np.full(len(plane), cells.heights[layer])])
     )
     values = cells.field[nearest]

@@ -111,7 +111,7 @@ def test_the_field_has_no_steps(ours: BilinearMap) -> None:
 
 def test_inside_is_the_distance_to_the_nearest_average(ours: BilinearMap) -> None:
     sample = ours.query(queries())
-    away = np.linalg.norm(queries()[:, None] - ours.cells.points, axis=-1).min(axis=1)
+    away = np.linalg.norm(queries()[:, None] - ours.readings.points, axis=-1).min(axis=1)
     np.testing.assert_array_equal(sample.inside, away <= OPTIONS.reach)
     assert 0 < sample.inside.sum() < len(sample.inside)
     field, gradient = ours.field_and_gradient(queries())
@@ -128,9 +128,9 @@ def test_the_averages_are_those_of_a_plain_loop(ours: BilinearMap) -> None:
         key = (HEIGHTS.index(z), round(x / OPTIONS.spacing), round(y / OPTIONS.spacing))
         rows.setdefault(key, []).append(row)
     expected = [np.hstack([points[r], field[r]]).mean(axis=0) for _, r in sorted(rows.items())]
-    found = np.hstack([ours.cells.points, ours.cells.field])
+    found = np.hstack([ours.readings.points, ours.readings.field])
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)  # rounding of sums
-    assert ours.cells.count.tolist() == [len(r) for _, r in sorted(rows.items())]
+    assert ours.readings.weight.tolist() == [len(r) for _, r in sorted(rows.items())]
 
 
 def test_the_variance_is_the_mean_square_of_the_readings_about_the_map(ours: BilinearMap) -> None:
@@ -228,7 +228,7 @@ def test_maps_satisfy_both_protocols(ours: BilinearMap) -> None:
 
 def test_a_summary_tells_what_went_in(ours: BilinearMap) -> None:
     summary = ours.summary
-    assert (summary.readings, summary.rows) == (len(readings()[0]), len(ours.cells.points))
+    assert (summary.readings, summary.rows) == (len(readings()[0]), len(ours.readings.points))
     assert summary.facts["heights of the layers (m)"] == "0.20, 0.50, 0.80"
     assert (summary.lower >= readings()[0].min(axis=0) - 1e-12).all()  # rounding of means
 

@@ -75,9 +75,9 @@ def test_a_grid_is_that_of_all_readings() -> None:
     updated = BilinearMap.fit(points[OLD], field[OLD]).updated(points[NEW], field[NEW])
     at_once = BilinearMap.fit(points, field)
     # Means of means and means: rounding.
-    np.testing.assert_allclose(updated.cells.points, at_once.cells.points, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(updated.cells.field, at_once.cells.field, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(updated.cells.count, at_once.cells.count)
+    np.testing.assert_allclose(updated.readings.points, at_once.readings.points, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(updated.readings.field, at_once.readings.field, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(updated.readings.weight, at_once.readings.weight)
     one, other = updated.query(queries()), at_once.query(queries())
     np.testing.assert_allclose(one.field, other.field, rtol=0, atol=1e-10)
     # The old readings' squares are carried over by the averages of their cells.
