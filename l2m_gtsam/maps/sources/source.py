@@ -11,11 +11,9 @@ with nodes ``s_k`` and weights ``w_k`` of Gauss and Legendre's quadrature over t
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from l2m_gtsam.data import FieldAndGradient, FloatArray
-from l2m_gtsam.maps.harmonic.dipoles import SOFT, add_dipoles
-from l2m_gtsam.maps.harmonic.triangular import FAST
+from l2m_gtsam.maps.harmonic.dipoles import add_dipoles, write_moment_rows
 
 UT_M3 = 0.1  # field of 1 A m^2 at 1 m: mu_0 / (4 pi) in uT m^3 per A m^2
 POSITION, MOMENT, HALF_AXIS = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -69,64 +67,25 @@ class SourceShape:
 
     def field_and_gradient(self, points: FloatArray) -> FieldAndGradient:
         """Return the field in uT, (N, 3), and its gradient in uT/m, (N, 3, 3), at points in m."""
-        s, w = self._nodes()
-        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
-        add_dipoles(points, self._places(s), UT_M3 * np.outer(w, self.moment), field, gradient)
-        return field, gradient
+        s, w = (NODES, WEIGHTS / 2) if self.is_bar else POINT
+        return self._sums(points, self._places(s), w)
 
     def derivatives(self, points: FloatArray) -> FloatArray:
         """Return derivatives of the field by all parameters, shape (N, 3, 9)."""
-        J = np.zeros((len(points), 3, PARAMETERS))
         # Of a dipole, too: the length of a bar starts to count with its square.
-        add_derivatives(points, self._places(NODES), self.moment, NODES, WEIGHTS / 2, J)
-        return J
+        places, w = self._places(NODES), WEIGHTS / 2
+        rows = np.empty((3 * len(places), 3, len(points)))
+        write_moment_rows(points, places, rows)
+        by_moment = UT_M3 * np.tensordot(w, rows.reshape(len(w), 3, 3, -1), 1).T
+        # A source that moves one way is seen as from points that move the other way.
+        by_place, by_half_axis = (-self._sums(points, places, share)[1] for share in (w, w * NODES))
+        return np.concatenate([by_place, by_moment, by_half_axis], axis=2)
 
-    def _nodes(self) -> tuple[FloatArray, FloatArray]:
-        return (NODES, WEIGHTS / 2) if self.is_bar else POINT
+    def _sums(self, points: FloatArray, places: FloatArray, share: FloatArray) -> FieldAndGradient:
+        """Return what nodes (K, 3) with shares of the moment, (K,), make at points."""
+        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        add_dipoles(points, places, UT_M3 * np.outer(share, self.moment), field, gradient)
+        return field, gradient
 
     def _places(self, s: FloatArray) -> FloatArray:
         return np.ascontiguousarray(self.position + np.outer(s, self.half_axis))
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def add_derivatives(
-    points: FloatArray,
-    places: FloatArray,
-    moment: FloatArray,
-    nodes: FloatArray,
-    weights: FloatArray,
-    J: FloatArray,
-) -> None:
-    """Add derivatives of a bar's field by its parameters, shape (N, 3, 9).
-
-    Parameters
-    ----------
-    points
-        Metres, shape (N, 3).
-    places, nodes, weights
-        Of K nodes: metres, shape (K, 3), along the bar from -1 to 1, and shares of the moment.
-    moment
-        In A m^2, shape (3,).
-    """
-    for n in range(len(points)):
-        for k in range(len(nodes)):
-            r = (
-                points[n, 0] - places[k, 0],
-                points[n, 1] - places[k, 1],
-                points[n, 2] - places[k, 2],
-            )
-            inverse = 1.0 / max(r[0] * r[0] + r[1] * r[1] + r[2] * r[2], SOFT * SOFT)
-            cube = UT_M3 * weights[k] * inverse * np.sqrt(inverse)
-            fifth = 3.0 * cube * inverse
-            pull = fifth * (moment[0] * r[0] + moment[1] * r[1] + moment[2] * r[2])
-            steep = -5.0 * pull * inverse
-            for i in range(3):
-                for j in range(3):
-                    by_moment = fifth * r[i] * r[j]
-                    by_place = -fifth * (r[i] * moment[j] + moment[i] * r[j]) - steep * r[i] * r[j]
-                    if i == j:
-                        by_moment -= cube
-                        by_place -= pull
-                    J[n, i, j] += by_place
-                    J[n, i, 3 + j] += by_moment
-                    J[n, i, 6 + j] += nodes[k] * by_place
