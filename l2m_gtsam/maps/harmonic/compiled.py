@@ -147,7 +147,8 @@ class CompiledTiles:
         for part in self.learnt.tiling.by_tile(points):
             tile = self.tile(part.tile)
             for start in range(0, len(part.rows), AT_ONCE):
-                rows, share = part.rows[start : start + AT_ONCE], part.share[start:]
+                at = slice(start, start + AT_ONCE)
+                rows, share = part.rows[at], part.share[at]
                 if isinstance(tile, CompiledTile):
                     tile.add_to(blend, points, rows, share)
                 else:

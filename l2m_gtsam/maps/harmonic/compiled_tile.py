@@ -312,7 +312,7 @@ def add_turned(
     Parameters
     ----------
     rows, share
-        Points that are added to, shape (K,), and the tile's share in each, shape (K,) or longer.
+        Points that are added to, shape (K,), and the tile's share in each, shape (K,).
     R_map_tile
         Axes of the tile, shape (3, 3).
     part_field, part_gradient

@@ -160,27 +160,12 @@ class Blend:
         Parameters
         ----------
         rows
-            Their indices, shape (K,).
+            Their indices, none twice, shape (K,).
         share
-            Of the tile in each, shape (K,) or longer.
+            Of the tile in each, shape (K,).
         values
             Field (K, 3) in uT and gradient (K, 3, 3) in uT/m.
         """
-        add_shares(rows, share, *values, self.field, self.gradient)
-
-
-@njit(cache=True, nogil=True)
-def add_shares(
-    rows: IntArray,
-    share: FloatArray,
-    part_field: FloatArray,
-    part_gradient: FloatArray,
-    field: FloatArray,
-    gradient: FloatArray,
-) -> None:
-    """Add what one tile predicts, times its share, to the rows of field and gradient."""
-    for n in range(len(rows)):
-        for i in range(3):
-            field[rows[n], i] += share[n] * part_field[n, i]
-            for j in range(3):
-                gradient[rows[n], i, j] += share[n] * part_gradient[n, i, j]
+        field, gradient = values
+        self.field[rows] += share[:, None] * field
+        self.gradient[rows] += share[:, None, None] * gradient
