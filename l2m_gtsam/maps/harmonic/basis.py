@@ -3,11 +3,10 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain, compress
 
 import numpy as np
 
-from l2m_gtsam.data import FieldAndGradient, FloatArray, IntArray
+from l2m_gtsam.data import FieldAndGradient, FloatArray
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles, moment_features
 from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, UniformField, WeightPrior
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame, turn_rows
@@ -42,13 +41,6 @@ class Basis:
 
     def __len__(self) -> int:
         return self.columns[-1].stop if self.families else 0
-
-    def of_kind(self, kind: type[Family]) -> tuple["Basis", IntArray]:
-        """Return the part of one kind of families, and its columns in the whole."""
-        chosen = [isinstance(family, kind) for family in self.families]
-        columns = [range(c.start, c.stop) for c, on in zip(self.columns, chosen, strict=True) if on]
-        part = Basis(self.frame, tuple(compress(self.families, chosen)))
-        return part, np.array(list(chain(*columns)), dtype=np.int64)
 
     def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
         """Return the prior of all weights."""

@@ -1,14 +1,14 @@
 """Scales and depths of one tile: steel is not spread evenly under a floor."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import EvidenceSlopes, Normal, evidence, marginalised
-from l2m_gtsam.maps.harmonic.family import BOUNDS, Hyperparameters, WeightPrior
+from l2m_gtsam.maps.harmonic.family import BOUNDS, Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.options import Options
 
@@ -70,8 +70,8 @@ def scored(
     options: LocalOptions,
 ) -> Hyperparameters:
     """Return where Fisher scoring leads from a start, over the waves that are informative there."""
-    informative = informative_modes(basis, normal, start)
-    slopes = informative.prior(start).slopes
+    waves, sums = informative_waves(basis, normal, start)
+    slopes = waves.prior(start).slopes
     names = [name for name in NAMES if name in slopes and slopes[name].any()]
     if not names:
         return start
@@ -79,8 +79,8 @@ def scored(
     low, high = np.log([BOUNDS[name] for name in names]).T
     best, highest, step = x, -np.inf, np.zeros_like(centre)
     for left in range(options.steps, -1, -1):
-        prior = informative.prior(moved(start, names, x))
-        found = evidence(informative.normal, prior.log_variance, shared.noise)
+        prior = waves.prior(moved(start, names, x))
+        found = evidence(sums, prior.log_variance, shared.noise)
         value = found.value - 0.5 * float(np.sum(((x - centre) / options.spread) ** 2))
         if value <= highest:
             step = 0.5 * step
@@ -95,45 +95,23 @@ def scored(
     return moved(start, names, best)
 
 
-@dataclass(frozen=True)
-class InformativeModes:
-    """The waves of a tile that carry information on scales and depths.
-
-    Attributes
-    ----------
-    waves
-        All floor and ceiling modes of the tile.
-    rows
-        Indices of the informative ones, shape (k,).
-    normal
-        Sums over the readings for these, all other weights integrated out.
-    """
-
-    waves: Basis
-    rows: IntArray
-    normal: Normal
-
-    def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
-        """Return the prior of these waves."""
-        prior = self.waves.prior(hyperparameters)
-        slopes = {name: slope[self.rows] for name, slope in prior.slopes.items()}
-        return WeightPrior(prior.log_variance[self.rows], slopes)
-
-
-def informative_modes(basis: Basis, normal: Normal, given: Hyperparameters) -> InformativeModes:
-    """Return the waves that could be known better than from their prior.
+def informative_waves(basis: Basis, normal: Normal, given: Hyperparameters) -> tuple[Basis, Normal]:
+    """Return the waves that could be known better than from their prior, and the sums for these.
 
     Short waves hardly reach the readings. They carry almost no information on scale and depth,
     and are half of all.
     """
-    waves, columns = basis.of_kind(Modes)
-    log_variance = basis.prior(given).log_variance
+    log_variance, waves = basis.prior(given).log_variance, []
     # Ratio of the information on each weight alone to that of its prior.
-    gain = np.exp(log_variance) * normal.FF.diagonal() / given.noise**2
-    rows = np.flatnonzero(gain[columns] > LEAST_GAIN)
+    kept = np.exp(log_variance) * normal.FF.diagonal() / given.noise**2 > LEAST_GAIN
+    for columns, family in zip(basis.columns, basis.families, strict=True):
+        if isinstance(family, Modes):
+            waves.append(replace(family, numbers=family.numbers[kept[columns]]))
+        else:
+            kept[columns] = False
     # All else stays as it is: integrated out once, not at each step.
-    kept = marginalised(normal, columns[rows], log_variance, given.noise)
-    return InformativeModes(waves, rows, kept)
+    sums = marginalised(normal, np.flatnonzero(kept), log_variance, given.noise)
+    return Basis(basis.frame, tuple(waves)), sums
 
 
 def scoring_step(
