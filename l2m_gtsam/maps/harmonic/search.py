@@ -7,9 +7,9 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.basis import Basis, batches
+from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
-from l2m_gtsam.maps.harmonic.evidence import Weights, condition, normal_of
+from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
@@ -39,38 +39,6 @@ class SearchOptions(Options):
 
 
 @dataclass(frozen=True)
-class Residuals:
-    """Readings of a tile and what its weights leave of them.
-
-    Attributes
-    ----------
-    basis, weights
-        What explains the readings so far.
-    readings
-        Readings of the tile, map frame, metres and uT.
-    noise
-        Standard deviation of a reading of weight one in uT.
-    """
-
-    basis: Basis
-    weights: Weights
-    readings: TrainingSet
-    noise: float
-
-    def white(self) -> tuple[FloatArray, FloatArray]:
-        """Return the whitened residuals (3 N,) and ``F L / sigma`` (3 N, m) of the readings."""
-        m, N = len(self.basis), len(self.readings)
-        scale = np.repeat(np.sqrt(self.readings.weight) / self.noise, 3)
-        half, left = np.empty((3 * N, m)), np.empty(3 * N)
-        for at in batches(N):
-            F = self.basis.features(self.readings.points[at]).reshape(-1, m)
-            rows = slice(3 * at.start, 3 * at.stop)
-            left[rows] = self.readings.field[at].ravel() - F @ self.weights.mean
-            half[rows] = self.weights.root(F)
-        return left * scale, half * scale[:, None]
-
-
-@dataclass(frozen=True)
 class Found:
     """A source that the residuals ask for: where, and how much it gains in nats."""
 
@@ -78,29 +46,37 @@ class Found:
     gain: float
 
 
-def residuals_of(
-    basis: Basis, readings: TrainingSet, hyperparameters: Hyperparameters
-) -> Residuals:
-    """Return what a basis leaves of readings."""
-    prior = basis.prior(hyperparameters)
-    normal = normal_of(basis, readings)
-    weights = condition(normal, prior.log_variance, hyperparameters.noise)
-    return Residuals(basis, weights, readings, hyperparameters.noise)
-
-
+@dataclass(frozen=True)
 class Search:
-    """Scores of candidate places against the residuals of one tile.
+    """Scores of candidate places against what m weights of a tile leave of its N readings.
 
-    Parameters
+    Attributes
     ----------
-    residuals
-        Readings of the tile and what its m weights leave of them, uT.
+    points
+        Of the readings, map frame, metres, shape (N, 3).
+    scale
+        What makes their noise white, in 1/uT, shape (N,).
+    left
+        What is left of them, white, shape (3 N,).
+    half
+        Root of the covariance of their prediction, white, shape (3 N, m).
     """
 
-    def __init__(self, residuals: Residuals) -> None:
-        self._left, self._half = residuals.white()
-        self._points = residuals.readings.points
-        self._scale = np.sqrt(residuals.readings.weight) / residuals.noise
+    points: FloatArray
+    scale: FloatArray
+    left: FloatArray
+    half: FloatArray
+
+    @classmethod
+    def of(cls, basis: Basis, readings: TrainingSet, hyperparameters: Hyperparameters) -> "Search":
+        """Return the scores beside what a basis explains."""
+        log_variance, noise = basis.prior(hyperparameters).log_variance, hyperparameters.noise
+        weights = condition(normal_of(basis, readings), log_variance, noise)
+        scale = np.sqrt(readings.weight) / noise
+        F = basis.features(readings.points).reshape(-1, len(basis))
+        F *= np.repeat(scale, 3)[:, None]
+        left = (readings.field * scale[:, None]).ravel() - F @ weights.mean
+        return cls(readings.points, scale, left, weights.root(F))
 
     def gains(self, places: FloatArray) -> FloatArray:
         """Return how many nats a source at each place (K, 3) gains at its best strength, (K,)."""
@@ -111,13 +87,13 @@ class Search:
         return gains
 
     def _gains(self, places: FloatArray) -> FloatArray:
-        K, m = len(places), self._half.shape[1]
-        moments = moment_features(self._points, places) * self._scale[:, None, None]
+        K, m = len(places), self.half.shape[1]
+        moments = moment_features(self.points, places) * self.scale[:, None, None]
         # Axis by axis: sums over rows then run along the places.
         Phi = np.ascontiguousarray(moments.reshape(-1, K, 3).transpose(0, 2, 1))
         rows = Phi.reshape(-1, 3 * K)
-        seen = (self._half.T @ rows).reshape(m, 3, K)
-        q = (self._left @ rows).reshape(3, K)
+        seen = (self.half.T @ rows).reshape(m, 3, K)
+        q = (self.left @ rows).reshape(3, K)
         s = np.empty((K, 3, 3))
         for i in range(3):
             for j in range(i + 1):
@@ -164,12 +140,9 @@ def unvisited(points: FloatArray, options: SearchOptions) -> FloatArray:
     return np.asarray(lattice[np.isfinite(away) & (away >= options.clearance)])
 
 
-def look_for_sources(
-    residuals: Residuals, places: FloatArray, options: SearchOptions
-) -> list[Found]:
+def look_for_sources(search: Search, places: FloatArray, options: SearchOptions) -> list[Found]:
     """Return the sources of one round: the best of some places (K, 3), apart from each other."""
-    points = residuals.readings.points
-    search, visited = Search(residuals), cKDTree(points)
+    visited = cKDTree(search.points)
     gains = search.gains(places)
     good = np.flatnonzero(gains >= options.gain)
     wanted = apart([Found(places[k], float(gains[k])) for k in good], options.apart)

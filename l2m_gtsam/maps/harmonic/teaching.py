@@ -24,9 +24,9 @@ from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
 from l2m_gtsam.maps.harmonic.search import (
     MOST_READINGS,
     Found,
+    Search,
     apart,
     look_for_sources,
-    residuals_of,
     unvisited,
 )
 from l2m_gtsam.maps.harmonic.structure import Sources
@@ -146,8 +146,8 @@ def found_in_tiles(plain: Learnt, tiles: list[int], options: HarmonicOptions) ->
         basis, readings = plain.basis(tile, rows, COARSE), plain.readings[rows]
         places = unvisited(readings.points, options.search)
         places = places[grid.block_of(places) == tile]
-        residuals = residuals_of(basis, readings, plain.hyperparameters)
-        return look_for_sources(residuals, places, options.search)
+        seen = Search.of(basis, readings, plain.hyperparameters)
+        return look_for_sources(seen, places, options.search)
 
     found = [each for part in in_threads(search, tiles) for each in part]
     # Neighbouring tiles may have seen the same steel.
