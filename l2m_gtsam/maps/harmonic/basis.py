@@ -9,7 +9,7 @@ import numpy as np
 from l2m_gtsam.data import FieldAndGradient, FloatArray
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles, moment_features
 from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, UniformField, WeightPrior
-from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame, turn_rows
+from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import Resolution
@@ -77,9 +77,8 @@ class Basis:
         rows = np.empty((len(self), 3, len(points)))
         for columns, family in zip(self.columns, self.families, strict=True):
             family.write_rows(local, units[columns], rows[columns])
-        if not np.array_equal(self.frame.R_map_tile, np.eye(3)):
-            turn_rows(self.frame.R_map_tile, rows)
-        return rows
+        R = self.frame.R_map_tile
+        return rows if np.array_equal(R, np.eye(3)) else R @ rows
 
     def field_and_gradient(self, points: FloatArray, weights: FloatArray) -> FieldAndGradient:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""

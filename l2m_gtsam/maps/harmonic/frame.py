@@ -94,16 +94,3 @@ def clip_rows(points: FloatArray, low: FloatArray, high: FloatArray, clipped: Fl
     for n in range(len(points)):
         for i in range(3):
             clipped[n, i] = min(max(points[n, i], low[i]), high[i])
-
-
-@njit(cache=True, nogil=True)
-def turn_rows(R_map_tile: FloatArray, rows: FloatArray) -> None:
-    """Turn vectors of a box's frame, shape (m, 3, N), into the map frame."""
-    R = R_map_tile
-    for m in range(len(rows)):
-        x, y, z = rows[m, 0], rows[m, 1], rows[m, 2]
-        for n in range(len(x)):
-            a, b, c = x[n], y[n], z[n]
-            x[n] = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-            y[n] = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-            z[n] = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
