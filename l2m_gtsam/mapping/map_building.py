@@ -6,13 +6,14 @@ from functools import reduce
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, Readings, Recording
+from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.shifts import suite_errors, survey_poses
 from l2m_gtsam.mapping.steady_survey import SteadySurvey, steady_survey
 from l2m_gtsam.mapping.suite_calibration import suite_doubts
-from l2m_gtsam.mapping.suite_drive import refuse_stuck
+from l2m_gtsam.mapping.suite_drive import parameters_of, refuse_stuck
+from l2m_gtsam.mapping.suite_likelihood import undistorted
 from l2m_gtsam.maps.build import KINDS, build_map
 from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap, check_frame, framed
@@ -226,28 +227,12 @@ def survey_readings(
     readings = synchronised.readings
     refuse_stuck(readings, recording)
     readings = with_offsets(readings, recording.trajectory, offset)
-    points, field = sensor_positions(readings, known), map_fields(readings, known)
+    undone = undistorted(readings, np.stack([parameters_of(each) for each in known]))
+    points, field = undone.points, undone.field
     poses = survey_poses(recording.trajectory, readings, points, field, pose_noise)
     doubts = saturation_doubts(readings.sensors, [each.limits for each in synchronised.counts])
-    errors = suite_errors(readings, known)
+    errors = suite_errors(readings, known, undone)
     return SurveyReadings(points, field, readings.stamp_ns, errors, poses, doubts)
-
-
-def sensor_positions(readings: Readings, known: Sequence[KnownSensor]) -> FloatArray:
-    """Return where each reading was taken in the map frame in metres, shape (N, 3)."""
-    t = np.stack([sensor.t_lidar_mag for sensor in known])[readings.sensor]
-    return np.asarray(
-        np.einsum("nij,nj->ni", readings.R_map_lidar, t) + readings.p_map_lidar, dtype=float
-    )
-
-
-def map_fields(readings: Readings, known: Sequence[KnownSensor]) -> FloatArray:
-    """Return the field that each reading stands for in the map frame in uT, shape (N, 3)."""
-    b_lidar = np.empty_like(readings.field)
-    for index, sensor in enumerate(known):
-        rows = readings.rows_of(index)
-        b_lidar[rows] = sensor.distortion.undo(readings.field[rows])
-    return np.asarray(np.einsum("nij,nj->ni", readings.R_map_lidar, b_lidar))
 
 
 def listed_sensor(

@@ -6,14 +6,15 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Trajectory
-from l2m_gtsam.mapping.suite_likelihood import field_slopes, place_slopes
+from l2m_gtsam.mapping.suite_likelihood import Undistorted, field_slopes, place_slopes
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.maps.survey_poses import POSE, SurveyPoses
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions, pose_roots
-from l2m_gtsam.solve.linear_algebra import right_divided
 
 
-def suite_errors(readings: Readings, known: Sequence[KnownSensor]) -> SuiteErrors:
+def suite_errors(
+    readings: Readings, known: Sequence[KnownSensor], undone: Undistorted
+) -> SuiteErrors:
     """Return what the sensors' errors do to their readings.
 
     Parameters
@@ -22,23 +23,15 @@ def suite_errors(readings: Readings, known: Sequence[KnownSensor]) -> SuiteError
         With poses at their stamps and the sensors' time offsets, and with motion.
     known
         The S sensors, in the readings' order; those without a covariance count as exact.
+    undone
+        The readings as these sensors have them.
     """
-    shift = np.zeros((len(readings), SHIFT, SIZE))
-    for index, sensor in enumerate(known):
-        rows = np.arange(len(readings))[readings.rows_of(index)]
-        shift[rows] = sensor_shift(readings[rows], sensor)
-    names, every = tuple(each.sensor for each in known), np.arange(len(readings))
-    return SuiteErrors(names, suite_covariance(known), every, readings.sensor, shift)
-
-
-def sensor_shift(readings: Readings, sensor: KnownSensor) -> FloatArray:
-    """Return the derivatives of (x, y) by the errors of the sensor that read, (n, 6, 16)."""
     if readings.motion is None:
         raise ValueError("the readings have no motion, so that no clock can be judged")
-    turned = right_divided(readings.R_map_lidar, sensor.distortion.C)
-    b_lidar = sensor.distortion.undo(readings.field)
-    of_places = place_slopes(readings, sensor.t_lidar_mag)
-    return np.concatenate([of_places, field_slopes(readings, turned, b_lidar)], axis=1)
+    of_field = field_slopes(readings, undone.turned, undone.b)
+    shift = np.concatenate([place_slopes(readings, undone.lever), of_field], axis=1)
+    names, every = tuple(each.sensor for each in known), np.arange(len(readings))
+    return SuiteErrors(names, suite_covariance(known), every, readings.sensor, shift)
 
 
 def suite_covariance(known: Sequence[KnownSensor]) -> FloatArray:

@@ -50,7 +50,7 @@ def suite_drive(
     readings = synchronised.readings
     refuse_stuck(readings, recording)
     known = [(assumed or {}).get(name, KnownSensor.ideal(name)) for name in readings.sensors]
-    start = np.stack([_parameters(each) for each in known])
+    start = np.stack([parameters_of(each) for each in known])
     return SuiteDrive(recording, readings, synchronised.counts, start)
 
 
@@ -69,6 +69,6 @@ def known_sensor(name: str, parameters: FloatArray) -> KnownSensor:
     return KnownSensor(name, parameters[:3], distortion, float(parameters[15]))
 
 
-def _parameters(sensor: KnownSensor) -> FloatArray:
+def parameters_of(sensor: KnownSensor) -> FloatArray:
     """Return (t, C row by row, H, time offset), shape (16,)."""
     return np.append(sensor.vector(), sensor.time_offset)

@@ -9,7 +9,9 @@ import pytest
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.data import KnownSensor, Recording
-from l2m_gtsam.mapping.map_building import map_fields, map_recordings, sensor_positions
+from l2m_gtsam.mapping.map_building import map_recordings
+from l2m_gtsam.mapping.suite_drive import parameters_of
+from l2m_gtsam.mapping.suite_likelihood import undistorted
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.recording.sync import synchronise
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
@@ -100,9 +102,10 @@ def test_the_calibrated_run_fits_the_map_better(
     readings = synchronise(run, config.calibration.sync).readings
     fitted = KnownSensor("imu/mag", plain.t_lidar_mag, plain.distortion)
     ideal = KnownSensor.ideal("imu/mag")
-    before, after = (ros1.query(sensor_positions(readings, [s])) for s in (ideal, fitted))
+    as_ideal, as_fitted = (undistorted(readings, parameters_of(s)[None]) for s in (ideal, fitted))
+    before, after = ros1.query(as_ideal.points), ros1.query(as_fitted.points)
     inside = before.inside & after.inside
-    raw = np.linalg.norm(map_fields(readings, [ideal]) - before.field, axis=1)[inside]
-    calibrated = np.linalg.norm(map_fields(readings, [fitted]) - after.field, axis=1)[inside]
+    raw = np.linalg.norm(as_ideal.field - before.field, axis=1)[inside]
+    calibrated = np.linalg.norm(as_fitted.field - after.field, axis=1)[inside]
     assert inside.sum() > 3000
     assert np.median(calibrated) < 0.9 * np.median(raw)

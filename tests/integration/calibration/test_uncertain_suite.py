@@ -8,8 +8,9 @@ from scipy.stats import chi2
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, LidarMotion, Readings
-from l2m_gtsam.mapping.map_building import map_fields, sensor_positions
 from l2m_gtsam.mapping.shifts import suite_errors
+from l2m_gtsam.mapping.suite_drive import parameters_of
+from l2m_gtsam.mapping.suite_likelihood import undistorted
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from tests.drives.uncertain import (
     GIVEN,
@@ -48,9 +49,9 @@ def survey(seed: int, stated: bool = True) -> HarmonicMap:
     field += rng.normal(0, GIVEN.noise, field.shape)
     still = LidarMotion.steady(np.zeros((count, 6)))
     read = Readings(("a", "b"), sensor, np.arange(count) * 10**8, R, p, field, motion=still)
-    points, mapped = sensor_positions(read, ideal), map_fields(read, ideal)
-    suite = suite_errors(read, ideal) if stated else None
-    return HarmonicMap.fit(points, mapped, OPTIONS, suite=suite)
+    undone = undistorted(read, np.stack([parameters_of(each) for each in ideal]))
+    suite = suite_errors(read, ideal, undone) if stated else None
+    return HarmonicMap.fit(undone.points, undone.field, OPTIONS, suite=suite)
 
 
 def off(sensor: KnownSensor, error: FloatArray) -> KnownSensor:

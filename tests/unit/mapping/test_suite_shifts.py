@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Trajectory
-from l2m_gtsam.mapping.map_building import map_fields, sensor_positions
 from l2m_gtsam.mapping.shifts import suite_covariance, suite_errors
 from l2m_gtsam.mapping.suite_calibration import errors_in_common
-from l2m_gtsam.mapping.suite_likelihood import TAU
+from l2m_gtsam.mapping.suite_drive import parameters_of
+from l2m_gtsam.mapping.suite_likelihood import TAU, Undistorted, undistorted
 from l2m_gtsam.maps.suite_errors import SIZE
 from l2m_gtsam.recording.sync import TWIST_S, with_offsets
 
@@ -40,7 +40,12 @@ def given(readings: Readings, sensors: list[KnownSensor]) -> FloatArray:
     """Return what a map is given of readings, shape (N, 6)."""
     offsets = np.array([each.time_offset for each in sensors])
     moved = with_offsets(readings, trajectory(), offsets)
-    return np.hstack([sensor_positions(moved, sensors), map_fields(moved, sensors)])
+    undone = as_known(moved, sensors)
+    return np.hstack([undone.points, undone.field])
+
+
+def as_known(readings: Readings, sensors: list[KnownSensor]) -> Undistorted:
+    return undistorted(readings, np.stack([parameters_of(each) for each in sensors]))
 
 
 def with_error(sensor: KnownSensor, k: int, step: float) -> KnownSensor:
@@ -66,7 +71,7 @@ def test_shifts_are_the_derivatives_of_what_a_map_is_given() -> None:
         rng.normal(0, 30, (count, 3)),
     )
     moving = with_offsets(bare, trajectory(), np.array([s.time_offset for s in sensors]))
-    shift = suite_errors(moving, sensors).shift
+    shift = suite_errors(moving, sensors, as_known(moving, sensors)).shift
     for k in range(SIZE):
         # A velocity is that over a while.
         step = TWIST_S / 2 if k == TAU else STEP
