@@ -79,14 +79,9 @@ def select_poses(bag: Log, options: BagOptions) -> list[Connection]:
     if options.poses is not None:
         return _named_poses(bag, options.poses, available)
     for msgtype in ALL_POSE_TYPES:
-        topics = sorted({c.topic for c in available if c.msgtype == msgtype})
-        if len(topics) == 1:
-            return [c for c in available if c.topic == topics[0]]
-        if topics:
-            raise BagError(
-                f"{bag.path}: several topics carry poses, choose one with `bag.poses`: "
-                f"{', '.join(topics)}"
-            )
+        if of_type := [c for c in available if c.msgtype == msgtype]:
+            topic = _one_topic(bag, of_type)
+            return [c for c in available if c.topic == topic]
     raise BagError(
         f"{bag.path}: no poses in it; needed is a topic of one of the types "
         f"{', '.join(map(_short, ROS_POSE_TYPES))}, a /tf chain named by "
@@ -223,9 +218,20 @@ def _no_field(bag: Log, pattern: str) -> str:
     )
 
 
+def _one_topic(bag: Log, with_poses: list[Connection]) -> str:
+    topics = sorted({c.topic for c in with_poses})
+    if len(topics) > 1:
+        raise BagError(
+            f"{bag.path}: several topics carry poses, choose one with `bag.poses`: "
+            f"{', '.join(topics)}"
+        )
+    return topics[0]
+
+
 def _named_poses(bag: Log, name: str, available: list[Connection]) -> list[Connection]:
     chosen = [c for c in available if matches(c.topic, name)]
     if chosen:
+        _one_topic(bag, chosen)  # a glob may fit several
         return chosen
     others = [c for c in bag.connections if matches(c.topic, name)]
     if others:

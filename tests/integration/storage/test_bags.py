@@ -190,6 +190,10 @@ def faulty(kind: str, name: str) -> tuple[list[Entry], BagOptions]:
             [*good, *(Entry("/other", e.msgtype, e.record_ns, e.message) for e in only_poses)],
             BagOptions(),
         ),
+        "poses by a glob": (
+            [*good, *(Entry("/poses", e.msgtype, e.record_ns, e.message) for e in only_poses)],
+            BagOptions(poses="/pose*"),
+        ),
         "no tf": (good, BagOptions(tf=TfChain(frame="map", child_frame="lidar"))),
         "all NaN": (entries(kind, field=lambda k: np.full(3, np.nan)), BagOptions()),
         "zero quaternion": (
@@ -207,6 +211,7 @@ FAULTS = {
     "poses of wrong type": r"/mag is of type .*, poses must be one of nav_msgs/msg/Odometry",
     "no poses": r"no poses in it; needed is .*`--poses`; there are: /mag ",
     "several poses": r"choose one with `bag.poses`: /other, /pose",
+    "poses by a glob": r"choose one with `bag.poses`: /pose, /poses",
     "no tf": r"no /tf in the bag, but `bag.tf` asks",
     "all NaN": r"no finite reading in /mag",
     "zero quaternion": r"an orientation is all zero",
