@@ -15,7 +15,7 @@ from l2m_gtsam.progress import Count
 from l2m_gtsam.recording.pose_order import order_notes
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps, TfChain
 from l2m_gtsam.storage.clocks import check_clocks, check_stamps, clock_notes
-from l2m_gtsam.storage.field_types import FieldSource, is_field
+from l2m_gtsam.storage.field_types import FieldSource, by_connection, is_field
 from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.log import Message
 from l2m_gtsam.storage.messages import (
@@ -35,7 +35,13 @@ from l2m_gtsam.storage.messages import (
 from l2m_gtsam.storage.open_bag import Bag
 from l2m_gtsam.storage.open_log import Log, open_log
 from l2m_gtsam.storage.pose_files import read_poses
-from l2m_gtsam.storage.selection import pose_notes, select_fields, select_poses, sensor_names
+from l2m_gtsam.storage.selection import (
+    fields_of_pattern,
+    pose_notes,
+    select_fields,
+    select_poses,
+    sensor_names,
+)
 from l2m_gtsam.storage.tf import Link, chain_frames, compose
 from l2m_gtsam.storage.units import field_fault, microtesla_per
 
@@ -110,7 +116,7 @@ def read_fields(path: Path, options: BagOptions) -> tuple[FieldSeries, ...]:
 
 
 def has_fields(path: Path, options: BagOptions) -> bool:
-    """Return whether a bag has any topic of a magnetometer.
+    """Return whether a bag has any topic of a magnetometer, by its type or by the options.
 
     Raises
     ------
@@ -118,7 +124,8 @@ def has_fields(path: Path, options: BagOptions) -> bool:
         The bag cannot be opened.
     """
     with open_log(path, options.columns) as bag:
-        return any(is_field(connection) for connection in bag.connections)
+        named = any(fields_of_pattern(bag, pattern) for pattern in options.fields)
+        return named or any(is_field(connection) for connection in bag.connections)
 
 
 def has_poses(path: Path, options: BagOptions) -> bool:
@@ -161,10 +168,7 @@ def _read(
     progress: Count | None,
 ) -> Buffers:
     """Make one pass over the bag."""
-    buffers = Buffers()
-    sources: dict[int, list[FieldSource]] = {}
-    for source in fields:
-        sources.setdefault(source.connection.id, []).append(source)
+    buffers, sources = Buffers(), by_connection(fields)
     single = [c for c in poses if c.msgtype != PATH_TYPE and c.id not in sources]
     wanted = {c.id: c for c in (*(f.connection for f in fields), *single)}
     for message in bag.messages(list(wanted.values()), progress):

@@ -1,7 +1,7 @@
 """Where magnetic readings are in messages: a table of types, or a path that the options name."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
 from operator import attrgetter
@@ -198,6 +198,14 @@ def stated_unit(connection: Connection) -> Unit | None:
 def named_source(connection: Connection, path: str) -> FieldSource:
     """Return where the readings of a topic of any type are, by a path."""
     return FieldSource(connection, f"{connection.topic}:{path}", path, None)
+
+
+def by_connection(sources: Sequence[FieldSource]) -> dict[int, list[FieldSource]]:
+    """Return sources by the number of their connection: of a topic there may be several."""
+    found: dict[int, list[FieldSource]] = {}
+    for source in sources:
+        found.setdefault(source.connection.id, []).append(source)
+    return found
 
 
 def is_field(connection: Connection) -> bool:

@@ -14,7 +14,13 @@ from l2m_gtsam.recording.pose_order import order_notes
 from l2m_gtsam.recording.saturation import saturated_axes, saturation_sentence
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps
 from l2m_gtsam.storage.clocks import UNSTAMPED, set_to_meet
-from l2m_gtsam.storage.field_types import FIELD_TYPES, VECTOR_TYPE, field_source, is_field
+from l2m_gtsam.storage.field_types import (
+    FIELD_TYPES,
+    VECTOR_TYPE,
+    by_connection,
+    field_source,
+    is_field,
+)
 from l2m_gtsam.storage.messages import ALL_POSE_TYPES, PATH_TYPE, POSE_TYPES, TF_TYPES
 from l2m_gtsam.storage.open_log import Log, open_log
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
@@ -134,8 +140,8 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
     with open_log(path, options.columns) as bag:
         fields, no_fields = _selected(select_fields, bag, options)
         poses, no_poses = ([], "") if apart is not None else _selected(select_poses, bag, options)
-        sources = {c.id: field_source(c) for c in bag.connections if c.msgtype in FIELD_TYPES}
-        sources |= {each.connection.id: each for each in fields}
+        sources = {c.id: [field_source(c)] for c in bag.connections if c.msgtype in FIELD_TYPES}
+        sources |= by_connection(fields)
         usable = [c for c in bag.connections if _is_usable(c) or c.id in sources]
         collected = collected_topics(bag, usable, sources, progress)
         if (fault := collect_paths(bag, poses, collected)) and not no_poses:
@@ -163,7 +169,8 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
         reports.append(_pose_file(apart, read, options))
         notes += order_notes(apart, read)
     obstacles = [reason for reason in (no_fields, no_poses) if reason]
-    obstacles += [f"{r.topic}: {r.use}" for r in reports if "refused" in r.use and r.topic in uses]
+    refusals = [r for r in reports if r.use.startswith("refused") and r.topic in uses]
+    obstacles += [f"{r.topic}: {r.use}" for r in refusals]
     used = [collected.get(each.connection.topic) for each in fields]
     if fields and not any(each is not None and each.is_alive for each in used):
         obstacles.append("no magnetic topic has readings that change")

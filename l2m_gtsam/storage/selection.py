@@ -40,7 +40,7 @@ def select_fields(bag: Log, options: BagOptions) -> list[FieldSource]:
     """
     chosen: list[FieldSource] = []
     for pattern in options.fields:
-        found = _of_pattern(bag, pattern)
+        found = fields_of_pattern(bag, pattern)
         if not found:
             raise BagError(_no_field(bag, pattern))
         labels = {(each.label, each.connection.id) for each in chosen}
@@ -48,8 +48,16 @@ def select_fields(bag: Log, options: BagOptions) -> list[FieldSource]:
     return chosen
 
 
-def _of_pattern(bag: Log, pattern: str) -> list[FieldSource]:
-    """Return the readings that a pattern names."""
+def fields_of_pattern(bag: Log, pattern: str) -> list[FieldSource]:
+    """Return where the readings that a pattern names stand; empty if it matches none.
+
+    Parameters
+    ----------
+    bag
+        The log.
+    pattern
+        One of `bag.fields`.
+    """
     topic, colon, path = pattern.partition(":")
     if colon:
         return [named_source(c, path) for c in bag.connections if matches(c.topic, topic)]

@@ -76,14 +76,17 @@ def pose_fault(bodies: Bodies, needed: set[str] | None) -> str:
 
 
 def collected_topics(
-    bag: Log, usable: list[Connection], sources: dict[int, FieldSource], progress: Count | None
+    bag: Log,
+    usable: list[Connection],
+    sources: dict[int, list[FieldSource]],
+    progress: Count | None,
 ) -> dict[str, TopicContent]:
     """Return what the messages on usable topics say."""
     collected: dict[str, TopicContent] = {}
     for message in bag.messages(usable, progress):
         into = collected.setdefault(message.connection.topic, TopicContent())
-        source = sources.get(message.connection.id)
-        _collect(into, message.content, message.connection.msgtype, message.record_ns, source)
+        there = sources.get(message.connection.id, [])
+        _collect(into, message.content, message.connection.msgtype, message.record_ns, there)
     return collected
 
 
@@ -104,7 +107,7 @@ def collect_paths(bag: Log, poses: list[Connection], collected: dict[str, TopicC
 
 
 def _collect(
-    into: TopicContent, content: Any, msgtype: str, record_ns: int, source: FieldSource | None
+    into: TopicContent, content: Any, msgtype: str, record_ns: int, sources: list[FieldSource]
 ) -> None:
     is_tf = msgtype in TF_TYPES
     for stamped in content.transforms if is_tf else (content,):
@@ -116,7 +119,7 @@ def _collect(
         body.add(stamp_of(stamped, record_ns), pose.position, pose.orientation)
         if pose.covariance is not None:
             into.covariances.add(pose.covariance)
-    if source is not None and not into.fault:
+    for source in [] if into.fault else sources:
         into.readings.unit = source.unit
         try:
             into.readings.add(record_ns, source.reading(content))

@@ -319,6 +319,13 @@ def test_a_path_beside_poses_is_no_note(tmp_path: Path) -> None:
     assert pose.use == "poses (preferred to /path; `bag.poses` chooses)"
 
 
+def test_a_name_is_no_refusal(tmp_path: Path) -> None:
+    make, content = ros("mcap"), entries("mcap")
+    path = make("nav_msgs/Path", header=make.header(START, "map"), poses=[])
+    bag = write(tmp_path, "mcap", [*content, Entry("/pose_refused", "nav_msgs/Path", START, path)])
+    assert inspect_bag(bag, BagOptions()).obstacles == ()
+
+
 def test_inspect_reports_instead_of_refusing(tmp_path: Path) -> None:
     content = [
         e for e in entries("mcap", field=lambda k: 1e4 * EARTH * (1 + k / 100)) if e.topic == "/mag"

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from rosbags.typesys import get_types_from_msg
 
 from l2m_gtsam.errors import BagError, UnitsError
-from l2m_gtsam.storage.bag import read_fields, read_recording, read_trajectory
+from l2m_gtsam.storage.bag import has_fields, read_fields, read_recording, read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.units import Unit
@@ -103,6 +103,23 @@ def test_vectors_that_nobody_called_magnetic(tmp_path: Path) -> None:
     assert len(report.obstacles) == 1
     named = read_fields(bag, BagOptions(fields=("/wrench",), units=Unit.MICROTESLA))
     assert [each.sensor for each in named] == ["wrench"]
+
+
+@pytest.mark.parametrize("named", ["/compass", "compass:vector"])
+def test_a_bag_has_the_readings_that_options_name(tmp_path: Path, named: str) -> None:
+    bag = write(tmp_path, "mcap", vectors("/compass", 1.0))
+    assert not has_fields(bag, BagOptions())
+    assert not has_fields(bag, BagOptions(fields=("/elsewhere",)))
+    assert has_fields(bag, BagOptions(fields=(named,)))
+
+
+def test_inspect_looks_at_every_path_of_a_topic(tmp_path: Path) -> None:
+    bag = write(tmp_path, "mcap", in_order(vectors("/mag", 1.0), path_messages("/path")))
+    options = BagOptions(fields=("/mag:nothing", "/mag:vector"), units=Unit.MICROTESLA)
+    with pytest.raises(BagError, match=r"on /mag has no 'nothing'"):
+        read_recording(bag, options)
+    (line,) = inspect_bag(bag, options).obstacles
+    assert line.startswith("/mag: refused: it has no 'nothing'")
 
 
 DRIVER = """std_msgs/Header header
