@@ -175,6 +175,16 @@ class Bag:
         return Codec(self.path, msgtype, store, is_ros1)
 
 
+class _AnyCaseReader(Ros2Reader):
+    """A reader of ROS2 bags to whom ``.MCAP`` is ``.mcap``."""
+
+    def __init__(self, path: Path) -> None:
+        known = Ros2Reader.STORAGE_PLUGINS
+        kind = "dir" if path.is_dir() else path.suffix.lower()
+        self.STORAGE_PLUGINS = {**known, path.suffix: known[kind]}
+        super().__init__(path)
+
+
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open a bag for reading.
@@ -185,13 +195,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
         No such file, not a bag, damaged, or without messages.
     """
     _check_files(path)
-    if path.suffix.lower() in TABLES:
-        raise BagError(
-            f"{path}: a bag is needed here, this is a table; for readings in one, `l2m export "
-            "--format json` has C and H"
-        )
     try:
-        reader = Ros1Reader(path) if path.suffix == ".bag" else Ros2Reader(path)
+        is_ros1 = path.suffix.lower() == ".bag"
+        reader = Ros1Reader(path) if is_ros1 else _AnyCaseReader(path)
         reader.open()
     except Exception as error:
         raise BagError(_damaged(path, error)) from error
@@ -210,6 +216,11 @@ def _check_files(path: Path) -> None:
         raise BagError(f"{path}: no such file; accepted: {ACCEPTED}")
     if not path.is_dir():
         require_regular(path, BagError)
+        if path.suffix.lower() in TABLES:
+            raise BagError(
+                f"{path}: a bag is needed here, this is a table; for readings in one, `l2m export "
+                "--format json` has C and H"
+            )
         if not is_bag(path):
             raise BagError(f"{path}: not a bag, by its name; accepted: {ACCEPTED}")
         return
@@ -218,7 +229,7 @@ def _check_files(path: Path) -> None:
     except OSError as error:
         raise BagError(f"{path}: cannot be read: {error.strerror or error}") from error
     for file in inside:
-        if file.suffix in STORED:
+        if file.suffix.lower() in STORED:
             require_regular(file, BagError)
     if not is_bag(path):
         logs = sorted(each.name for each in path.iterdir() if _may_be_log(each))

@@ -12,6 +12,7 @@ from l2m_gtsam.errors import BagError, L2MError, UnitsError
 from l2m_gtsam.storage.bag import read_recording, read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions, FixedTransform, Stamps, TfChain
 from l2m_gtsam.storage.inspect import inspect_bag
+from l2m_gtsam.storage.open_bag import open_bag
 from l2m_gtsam.storage.units import Unit
 from tests.drives.bags import KINDS, Entry, ros, write
 from tests.support.memory import with_peak
@@ -262,6 +263,25 @@ def test_paths_that_are_no_bags(tmp_path: Path) -> None:
     for name in ("nowhere.bag", "text.bag", "text.mcap", "."):
         with pytest.raises(BagError, match=r"accepted: a ROS1 .bag"):
             read_recording(tmp_path / name, BagOptions())
+
+
+@pytest.mark.parametrize("name", ["readings.csv", "flight.ulg"])
+def test_a_table_where_a_bag_is_needed(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with (
+        pytest.raises(BagError, match="a bag is needed here, this is a table"),
+        open_bag(tmp_path / name),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("kind", "ending"), [("ros1", "BAG"), ("sqlite3", "DB3"), ("mcap", "Mcap")]
+)
+def test_endings_in_capitals(tmp_path: Path, kind: str, ending: str) -> None:
+    file = bag_file(write(tmp_path, kind, entries(kind)))
+    path = file.rename(tmp_path / f"DRIVE.{ending}")
+    assert len(read_recording(path, BagOptions()).trajectory) == 30
 
 
 def test_memory_does_not_grow_with_images(tmp_path: Path) -> None:
