@@ -10,6 +10,8 @@ from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
+from l2m_gtsam.errors import ConfigError
+
 MOST_THREADS = 8
 THREADS = "L2M_THREADS"
 """Environment variable: how many threads a process may use; all cores where it is not set."""
@@ -33,14 +35,31 @@ def one_blas_thread() -> Iterator[None]:
 
 
 def in_threads(work: Callable[[In], Out], items: Iterable[In]) -> list[Out]:
-    """Return the results in the order of the items; BLAS has one thread meanwhile."""
+    """Return the results in the order of the items; BLAS has one thread meanwhile.
+
+    Raises
+    ------
+    ConfigError
+        If L2M_THREADS is not a number of threads.
+    """
     pieces = list(items)
-    threads = min(int(environ.get(THREADS) or cpu_count() or 1), MOST_THREADS, len(pieces))
+    threads = min(_allowed(environ.get(THREADS)), MOST_THREADS, len(pieces))
     with one_blas_thread():
         if threads <= 1:
             return [work(piece) for piece in pieces]
         with ThreadPoolExecutor(threads) as pool:
             return list(pool.map(work, pieces))
+
+
+def _allowed(text: str | None) -> int:
+    if not text:
+        return cpu_count() or 1
+    try:
+        return int(text)
+    except ValueError:
+        raise ConfigError(
+            f"{THREADS}: {text!r} is not a number of threads; accepted: a whole number"
+        ) from None
 
 
 def side_by_side(first: Callable[[], In], second: Callable[[], Out]) -> tuple[In, Out]:

@@ -9,6 +9,7 @@ import scipy.linalg  # noqa: F401 - brings a BLAS of its own
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from l2m_gtsam.calibration import calibrate
+from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.mapping import map_building, suite_calibration
 from l2m_gtsam.parallel.threads import in_threads, one_blas_thread, side_by_side
 from l2m_gtsam.planning import plan
@@ -126,6 +127,12 @@ def test_public_functions_compute_with_one_thread(entry: Callable[..., Any]) -> 
         entry(*[Watched() for _ in range(count)])
     assert seen == [{1}]
     assert blas_threads() == {GIVEN}
+
+
+def test_a_number_of_threads_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("L2M_THREADS", "two")
+    with pytest.raises(ConfigError, match="L2M_THREADS: 'two' is not a number of threads"):
+        in_threads(abs, [1])
 
 
 def test_two_pieces_of_work_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
