@@ -161,9 +161,10 @@ class _MergedScans:
 
     def _twist(self, scan: Scan, pose: RigidTransform) -> FloatArray | None:
         """Return the lidar's mean twist over a scan; nothing where its end has no pose."""
-        if scan.time_s is None or not np.any(scan.time_s):
+        time_s = np.zeros(1) if scan.time_s is None else scan.time_s
+        furthest = float(time_s[np.nanargmax(np.abs(time_s))])
+        if furthest == 0.0:
             return np.zeros(6)
-        furthest = float(scan.time_s[np.nanargmax(np.abs(scan.time_s))])
         end = self._pose_at(scan.stamp_ns + round(furthest * 1e9))
         if end is None:
             return None

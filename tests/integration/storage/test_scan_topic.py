@@ -207,6 +207,21 @@ def test_swept_scans_of_a_mapping_drive_are_brought_to_their_stamps(tmp_path: Pa
     assert len(found.points) == len(hall)
 
 
+def test_a_driver_that_leaves_times_empty_takes_snapshots(tmp_path: Path) -> None:
+    seconds = np.zeros(len(POINTS))
+    seconds[3] = np.nan
+    path = write(tmp_path, "mcap", entries([timed(CLOCKS["velodyne"], POINTS, seconds)]))
+    poses = Trajectory(
+        np.array([START, START + SECOND]),
+        np.stack([np.eye(3)] * 2),
+        np.zeros((2, 3)),
+        "map",
+        "lidar",
+    )
+    found = read_cloud_topic(path, "/points", poses, CloudTopicOptions(edge=0.01, min_range=0.0))
+    assert (found.without_pose, len(found.points)) == (0, len(POINTS))
+
+
 def test_ranges_must_leave_room() -> None:
     with pytest.raises(ValidationError, match="`min_range` must be less"):
         ScanOptions(min_range=30.0)
