@@ -87,7 +87,8 @@ def _entry(sensor: ExportedSensor, export: Export) -> dict[str, Any]:
     if offset is not None and offset.estimated:
         entry["timeshift_mag_lidar"] = offset.seconds
     if not _split_by_frame(export):
-        entry["rostopic"] = f"/{sensor.calibration.sensor}"
+        topic, _, _ = sensor.calibration.sensor.partition(":")  # TOPIC:PATH of `bag.fields`
+        entry["rostopic"] = f"/{topic}"
     return entry
 
 

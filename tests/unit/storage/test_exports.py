@@ -113,6 +113,11 @@ def test_kalibr_has_no_shift_that_was_held_and_no_topic_that_is_not_known() -> N
     assert set(YAML(typ="safe").load(text)["mag0"]) == {"sensor", "frame", "T_mag_lidar"}
 
 
+def test_kalibrs_topic_has_no_path_into_its_messages() -> None:
+    (entry,) = YAML(typ="safe").load(kalibr_text(mounted([sensor("imu/data:mag")]))).values()
+    assert entry["rostopic"] == "/imu/data"
+
+
 @given(rotations())
 def test_json_corrects_readings_and_moves_points(R: FloatArray) -> None:
     """An independent reader, which knows the file alone."""
