@@ -7,6 +7,7 @@ short is left out when the log is read.
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -15,6 +16,7 @@ import numpy.typing as npt
 
 from l2m_gtsam.data import MapState, Trajectory
 from l2m_gtsam.errors import ConfigError, MapError
+from l2m_gtsam.storage.bounded import open_regular
 from l2m_gtsam.storage.files import unwritten
 from l2m_gtsam.storage.map_file import load_map, save_map
 
@@ -89,9 +91,9 @@ def read_log(path: Path) -> tuple[LogLine, ...]:
         There is no such file, or it is no log.
     """
     try:
-        with path.open(encoding="utf-8") as file:
+        with TextIOWrapper(open_regular(path), encoding="utf-8") as file:
             return tuple(_lines(path, file))
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: not a log that can be read; begin without --resume") from error
 
 
