@@ -123,12 +123,33 @@ def localise_scans(
     LidarError
         There are no scans, or the first does not fit the cloud at the start.
     """
-    found = _Localiser(cloud, options)
+    fixes, poses, refused = list[PoseFix](), list[PoseEstimate](), Counter[Refusal]()
+    last: PoseEstimate | None = None
     for step in steps:
-        found.add(step, start)
-    if not found.fixes:
+        expected = start if last is None else _expected(last, step)
+        found = register(step.surface, cloud, expected.T, options.registration)
+        refusal = found.refusal(options.registration)
+        if refusal is not None and last is None:
+            raise LidarError(_not_at_start(start.T, found, refusal, options.registration))
+        if refusal is not None:
+            refused[refusal] += 1
+            last = expected
+            continue
+        fix = by_scan(found, expected.T, options.registration)
+        last = combined(found, expected, options.registration)
+        fixes.append(PoseFix(step.stamp_ns, fix.T, fix.covariance + options.of_cloud()))
+        poses.append(last)
+    if not fixes:
         raise LidarError("no scan has points enough to be localised")
-    return ScanLocalisation(tuple(found.fixes), found.trajectory(frame), dict(found.refused))
+    trajectory = Trajectory(
+        np.array([each.stamp_ns for each in fixes], dtype=np.int64),
+        np.array([each.T.R for each in poses]),
+        np.array([each.T.t for each in poses]),
+        frame,
+        CHILD_FRAME,
+        np.array([each.covariance for each in poses]) + options.of_cloud(),
+    )
+    return ScanLocalisation(tuple(fixes), trajectory, dict(refused))
 
 
 def spaced(
@@ -163,46 +184,9 @@ def spaced(
     )
 
 
-class _Localiser:
-    """The poses so far."""
-
-    def __init__(self, cloud: Surface, options: ScanLocalisationOptions) -> None:
-        self._cloud, self._options = cloud, options
-        self._last: PoseEstimate | None = None
-        self.fixes: list[PoseFix] = []
-        self.poses: list[PoseEstimate] = []
-        self.refused: Counter[Refusal] = Counter()
-
-    def add(self, step: ScanStep, start: PoseEstimate) -> None:
-        options = self._options.registration
-        expected = start if self._last is None else self._expected(self._last, step)
-        found = register(step.surface, self._cloud, expected.T, options)
-        refusal = found.refusal(options)
-        if refusal is not None and self._last is None:
-            raise LidarError(_not_at_start(start.T, found, refusal, options))
-        if refusal is not None:
-            self.refused[refusal] += 1
-            self._last = expected
-            return
-        fix = by_scan(found, expected.T, options)
-        self._last = combined(found, expected, options)
-        covariance = fix.covariance + self._options.of_cloud()
-        self.fixes.append(PoseFix(step.stamp_ns, fix.T, covariance))
-        self.poses.append(self._last)
-
-    def trajectory(self, frame: str) -> Trajectory:
-        return Trajectory(
-            np.array([each.stamp_ns for each in self.fixes], dtype=np.int64),
-            np.array([each.T.R for each in self.poses]),
-            np.array([each.T.t for each in self.poses]),
-            frame,
-            CHILD_FRAME,
-            np.array([each.covariance for each in self.poses]) + self._options.of_cloud(),
-        )
-
-    def _expected(self, last: PoseEstimate, step: ScanStep) -> PoseEstimate:
-        covariance = moved(last.covariance[None], step.step)[0] + step.covariance
-        return PoseEstimate(compose(last.T, step.step), covariance)
+def _expected(last: PoseEstimate, step: ScanStep) -> PoseEstimate:
+    covariance = moved(last.covariance[None], step.step)[0] + step.covariance
+    return PoseEstimate(compose(last.T, step.step), covariance)
 
 
 def _not_at_start(
