@@ -23,10 +23,9 @@ from l2m_gtsam.data import (
 from l2m_gtsam.errors import InputError, UnitsError
 from l2m_gtsam.storage.known_sensors import (
     LARGEST_OFFSET_S,
-    StatedClock,
-    StatedErrors,
     checked_gains,
     checked_place,
+    stated_covariance,
 )
 from l2m_gtsam.storage.units import Unit, Units, field_fault, microtesla_per, strength_fault
 
@@ -138,16 +137,16 @@ def known_sensor(
     late = float(_numbers("time_offset", time_offset, ()))
     if abs(late) > LARGEST_OFFSET_S:
         raise InputError(f"time_offset: {late:g} s; at most {LARGEST_OFFSET_S:g} s are accepted")
-    errors = StatedErrors(
-        covariance=_plain(covariance),
-        t_sigma=_plain(t_sigma),
-        C_sigma=_plain(C_sigma),
-        H_sigma=_plain(H_sigma),
-        time_offset=StatedClock(sigma=_plain(time_offset_sigma)),
-    )
+    stated = {
+        "covariance": _plain(covariance),
+        "t_sigma": _plain(t_sigma),
+        "C_sigma": _plain(C_sigma),
+        "H_sigma": _plain(H_sigma),
+        "time_offset": {"sigma": _plain(time_offset_sigma)},
+    }
     try:
         distortion = Distortion(checked_gains(gains), offset)
-        return KnownSensor(name, checked_place(place), distortion, late, errors.known())
+        return KnownSensor(name, checked_place(place), distortion, late, stated_covariance(stated))
     except ValueError as error:
         told = str(error).replace("time_offset.sigma", "time_offset_sigma")  # its name in a file
         raise InputError(f"{name}: {told}") from error

@@ -1,6 +1,7 @@
 """Files of sensors whose place and distortion are known, and how well they are known."""
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -26,71 +27,66 @@ LIKE = 0.85  # of ``difflib``: two letters of seven that changed places
 OPEN = np.repeat([1.0, 1.0, 100.0, 0.1], [3, 9, 3, 1])
 
 
-class StatedClock(BaseModel):
-    """How well a time offset is known."""
+def stated_covariance(stated: Mapping[str, Any]) -> FloatArray | None:
+    """Return the covariance of (t, C row by row, H, time offset), (16, 16); none if not said.
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
-    sigma: Any = None
-    cross_covariance: Any = None
+    Parameters
+    ----------
+    stated
+        What a file says of a sensor's errors; all of it may be absent.
 
-
-class StatedErrors(BaseModel):
-    """What a file says of a sensor's errors; all of it may be absent."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)
-    covariance: Any = None
-    common: Any = None
-    t_sigma: Any = None
-    C_sigma: Any = None
-    H_sigma: Any = None
-    time_offset: StatedClock | None = None
-
-    def known(self) -> FloatArray | None:
-        """Return the covariance of (t, C row by row, H, time offset), (16, 16); none if not said.
-
-        Raises
-        ------
-        ValueError
-            A sigma is not positive, or the covariance is none.
-        """
-        clock = StatedClock() if self.time_offset is None else self.time_offset
-        if self.covariance is None:
-            own = _of_sigmas(self, clock)
-        else:
-            own = np.zeros((SIZE, SIZE))
-            own[:TAU, :TAU] = _numbers("covariance", self.covariance, (TAU, TAU))
-            own[TAU, TAU] = _variance_of(clock)
-            if clock.cross_covariance is not None and own[TAU, TAU] > 0:
-                cross = _numbers("time_offset.cross_covariance", clock.cross_covariance, (TAU,))
-                own[:TAU, TAU] = own[TAU, :TAU] = cross
-        return None if own is None else _proper(own)
-
-    def in_common(self) -> FloatArray | None:
-        """Return the root of what is common with the file's other sensors, (16, r); none if not.
-
-        Raises
-        ------
-        ValueError
-            It is no part of the covariance.
-        """
-        if self.common is None:
-            return None
-        root, own = _numbers("common", self.common, None), self.known()
-        if root.ndim != 2 or len(root) != SIZE or not np.isfinite(root).all():
-            raise ValueError(f"common has shape {root.shape}; {SIZE} rows of numbers are needed")
-        if own is None:
-            raise ValueError("common is part of a covariance, which is missing")
-        sigma = np.sqrt(np.diag(own))
-        scale = np.where(sigma > 0, sigma, 1.0)
-        if np.linalg.eigvalsh((own - root @ root.T) / np.outer(scale, scale)).min() < -ROUNDING:
-            raise ValueError("common is larger than the covariance that it is part of")
-        return root
+    Raises
+    ------
+    ValueError
+        A sigma is not positive, or the covariance is none.
+    """
+    clock = stated.get("time_offset") or {}
+    if stated.get("covariance") is None:
+        own = _of_sigmas(stated, clock)
+    else:
+        own = np.zeros((SIZE, SIZE))
+        own[:TAU, :TAU] = _numbers("covariance", stated["covariance"], (TAU, TAU))
+        own[TAU, TAU] = _variance_of(clock)
+        cross = clock.get("cross_covariance")
+        if cross is not None and own[TAU, TAU] > 0:
+            own[:TAU, TAU] = _numbers("time_offset.cross_covariance", cross, (TAU,))
+            own[TAU, :TAU] = own[:TAU, TAU]
+    return None if own is None else _proper(own)
 
 
-def _of_sigmas(stated: StatedErrors, clock: StatedClock) -> FloatArray | None:
+def common_root(stated: Mapping[str, Any], own: FloatArray | None) -> FloatArray | None:
+    """Return the root of what is common with the file's other sensors, (16, r); none if not said.
+
+    Parameters
+    ----------
+    stated
+        As of ``stated_covariance``.
+    own
+        What that returns.
+
+    Raises
+    ------
+    ValueError
+        It is no part of the covariance.
+    """
+    if stated.get("common") is None:
+        return None
+    root = _numbers("common", stated["common"], None)
+    if root.ndim != 2 or len(root) != SIZE or not np.isfinite(root).all():
+        raise ValueError(f"common has shape {root.shape}; {SIZE} rows of numbers are needed")
+    if own is None:
+        raise ValueError("common is part of a covariance, which is missing")
+    sigma = np.sqrt(np.diag(own))
+    scale = np.where(sigma > 0, sigma, 1.0)
+    if np.linalg.eigvalsh((own - root @ root.T) / np.outer(scale, scale)).min() < -ROUNDING:
+        raise ValueError("common is larger than the covariance that it is part of")
+    return root
+
+
+def _of_sigmas(stated: Mapping[str, Any], clock: Mapping[str, Any]) -> FloatArray | None:
     """Return a diagonal covariance; what no sigma is given for counts as exact."""
-    given = [getattr(stated, name) for name in SHAPES]
-    if all(each is None for each in given) and clock.sigma is None:
+    given = [stated.get(name) for name in SHAPES]
+    if all(each is None for each in given) and clock.get("sigma") is None:
         return None
     sigmas = [
         np.zeros(shape) if each is None else _sigma(name, each, shape)
@@ -100,11 +96,11 @@ def _of_sigmas(stated: StatedErrors, clock: StatedClock) -> FloatArray | None:
     return np.diag(np.append(np.concatenate(variances), _variance_of(clock)))
 
 
-def _variance_of(clock: StatedClock) -> float:
+def _variance_of(clock: Mapping[str, Any]) -> float:
     """Return that of a time offset; one that was held, or has no sigma, counts as exact."""
-    if clock.sigma is None:
+    if clock.get("sigma") is None:
         return 0.0
-    sigma = float(_numbers("time_offset.sigma", clock.sigma, ()))
+    sigma = float(_numbers("time_offset.sigma", clock["sigma"], ()))
     if not sigma >= 0:
         raise ValueError(f"time_offset.sigma is {sigma:g}; a sigma is positive")
     return sigma**2 if np.isfinite(sigma) else 0.0
@@ -205,7 +201,7 @@ class _Known(_Finite):
 class _Stated(_Known):
     """A sensor with what a file says of its errors."""
 
-    errors: StatedErrors = StatedErrors()
+    errors: dict[Any, Any] = Field(default_factory=dict)
 
     @model_validator(mode="before")
     @classmethod
@@ -214,9 +210,14 @@ class _Stated(_Known):
 
     @model_validator(mode="after")
     def _credible(self) -> Self:
-        self.errors.in_common()
-        self.errors.known()
+        self.known("")
         return self
+
+    def known(self, name: str) -> KnownSensor:
+        """Return it as a sensor with a name and with its errors."""
+        own = stated_covariance(self.errors)
+        common = common_root(self.errors, own)
+        return replace(super().known(name), covariance=own, common=common)
 
 
 class _Judged(_Finite):
@@ -252,7 +253,7 @@ class ListedSensor(_Known):
         return TimeOffset(self.time_offset.seconds, float("inf"), np.zeros(15), "it is listed")
 
 
-KEYS = sorted({*ListedSensor.model_fields, *StatedErrors.model_fields})  # that are read
+KEYS = sorted({*ListedSensor.model_fields, "covariance", "common"})  # that are read
 
 
 def _meant(key: str) -> str | None:
@@ -335,12 +336,7 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     checked_id(path, content, CalibrationError)
     if found.verdict is not None and found.verdict.level is Level.FAIL:
         warnings.warn(f"{path}: its verdict is FAIL; its sensors are used", Notice, stacklevel=2)
-    return {
-        name: replace(
-            entry.known(name), covariance=entry.errors.known(), common=entry.errors.in_common()
-        )
-        for name, entry in found.sensors.items()
-    }
+    return {name: entry.known(name) for name, entry in found.sensors.items()}
 
 
 def level_of(path: Path) -> Level | None:

@@ -59,6 +59,7 @@ def test_what_a_calibration_left_open_is_open(tmp_path: Path) -> None:
         ({"C_sigma": "much"}, "C_sigma"),
         ({"C_sigma": [0.1, 0.1]}, "C_sigma"),
         ({"time_offset": {"sigma": -1}}, "time_offset.sigma"),
+        ({"time_offset": 0.1}, "time_offset: names with values are expected"),
         ({"covariance": [[1.0]]}, "covariance"),
         ({"covariance": (-np.eye(15)).tolist()}, "covariance"),
         ({"covariance": (np.eye(15) + np.eye(15, k=1)).tolist()}, "covariance"),
