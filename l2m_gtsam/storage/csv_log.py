@@ -19,7 +19,7 @@ from l2m_gtsam.storage.csv_columns import Roles, column_roles
 from l2m_gtsam.storage.field_types import CSV_FIELD_TYPE
 from l2m_gtsam.storage.files import open_text
 from l2m_gtsam.storage.log import TableLog, TableTopic
-from l2m_gtsam.storage.messages import CSV_POSE_TYPE, Orientation, Position
+from l2m_gtsam.storage.messages import CSV_POSE_TYPE, Orientation, Position, RawPose
 from l2m_gtsam.text import shown
 
 NS_PER = {
@@ -44,14 +44,6 @@ class CsvReading:
     """A row's reading."""
 
     field: Position
-
-
-@dataclass(frozen=True)
-class CsvPose:
-    """A row's pose."""
-
-    position: Position
-    orientation: Orientation
 
 
 @dataclass(frozen=True)
@@ -277,7 +269,7 @@ def _poses(table: NamedColumns) -> TableTopic:
     kept = ~np.isnan(values).any(axis=1)
     rows = values[kept]
 
-    def contents() -> Iterator[CsvPose]:
-        return (CsvPose(Position(*row[:3]), Orientation(*row[3:])) for row in rows.tolist())
+    def contents() -> Iterator[RawPose]:
+        return (RawPose(Position(*row[:3]), Orientation(*row[3:]), "") for row in rows.tolist())
 
     return TableTopic(POSE_TOPIC, CSV_POSE_TYPE, table.stamp_ns[kept], contents)

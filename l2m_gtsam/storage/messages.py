@@ -158,7 +158,7 @@ POSE_TYPES: dict[str, Callable[[Any], RawPose]] = {
     TRANSFORM_TYPE: lambda m: RawPose(
         m.transform.translation, m.transform.rotation, m.child_frame_id
     ),
-    CSV_POSE_TYPE: lambda m: RawPose(m.position, m.orientation, ""),
+    CSV_POSE_TYPE: lambda m: m,  # a RawPose
     PX4_POSE_TYPE: lambda m: px4_pose(m.position, m.q),
 }
 # A path comes last: some repeat where a vehicle was, others are plans of where it shall go.

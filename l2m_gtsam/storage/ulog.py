@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import IntArray
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bounded import opened
 from l2m_gtsam.storage.field_types import PX4_TYPE
@@ -122,15 +122,6 @@ def _type_of(topic: _Topic) -> str:
     return "px4_msgs/msg/" + "".join(word.capitalize() for word in topic.name.split("_"))
 
 
-@dataclass(frozen=True)
-class _LocalPose:
-    """A position and an attitude of the estimator at its time."""
-
-    timestamp: int
-    position: list[float]
-    q: list[float]
-
-
 def _local_pose(topics: Sequence[_Topic]) -> Iterator[TableTopic]:
     """Yield local positions with the attitudes between them, if both are there."""
     by_name = {each.name: each.columns for each in reversed(topics)}
@@ -151,7 +142,10 @@ def _local_pose(topics: Sequence[_Topic]) -> Iterator[TableTopic]:
     p = np.column_stack([place[axis] for axis in "xyz"])[inside].astype(np.float64)
     turned = Slerp(taken - taken[0], Rotation.from_quat(q))(stamps[inside] - taken[0])
     xyzw = turned.as_quat()
-    yield _pose_channel(stamps[inside], p, xyzw[:, [3, 0, 1, 2]])
+    rows = zip(stamps[inside].tolist(), p.tolist(), xyzw[:, [3, 0, 1, 2]].tolist(), strict=True)
+    message = make_dataclass("Px4Message", ["timestamp", "position", "q"])
+    poses = [message(*row) for row in rows]
+    yield TableTopic(LOCAL_POSE, PX4_POSE_TYPE, 1000 * stamps[inside], lambda: iter(poses))
 
 
 def _sampled(columns: dict[str, np.ndarray[Any, Any]]) -> IntArray:
@@ -160,9 +154,3 @@ def _sampled(columns: dict[str, np.ndarray[Any, Any]]) -> IntArray:
     unknown = sampled is None or not sampled.all() or sampled.max() > LATEST_US
     taken = columns["timestamp"] if unknown or sampled is None else sampled
     return np.asarray(taken.astype(np.int64))
-
-
-def _pose_channel(stamp_us: IntArray, p: FloatArray, wxyz: FloatArray) -> TableTopic:
-    rows = zip(stamp_us.tolist(), p.tolist(), wxyz.tolist(), strict=True)
-    poses = [_LocalPose(*row) for row in rows]
-    return TableTopic(LOCAL_POSE, PX4_POSE_TYPE, 1000 * stamp_us, lambda: iter(poses))
