@@ -196,9 +196,9 @@ def corrections_of(
             f"a part of the readings follows {missing[0]!r}, which `bag.regressors` does not name; "
             "say in --config where it is recorded"
         )
-    topics = {name: own.regressors[name] for name in names}
+    asked = {"regressors": {name: own.regressors[name] for name in names}}
     count = counter(f"reading numbers of {bag.name}", progress)
-    scalars = read_scalars(bag, topics, own.stamps, count, own.columns)
+    scalars = read_scalars(bag, own.model_copy(update=asked), count)
     series, resampling = {each.name: each for each in scalars}, config.calibration.regressors
     return {
         sensor.sensor: _correction(sensor, [series[m.name] for m in sensor.moving], resampling)

@@ -82,8 +82,7 @@ def read_drive_and_numbers(bag: Path, config: Config, progress: Progress) -> Rec
 def read_numbers(bag: Path, config: Config, progress: Progress) -> tuple[ScalarSeries, ...]:
     """Return the numbers of a bag that the configuration names."""
     count = counter(f"reading numbers of {bag.name}", progress)
-    own = config.bag
-    return read_scalars(bag, own.regressors, own.stamps, count, own.columns)
+    return read_scalars(bag, config.bag, count)
 
 
 def check_bags(bags: Sequence[Path]) -> None:

@@ -1,16 +1,16 @@
 """Read numbers out of a bag that go along with a drive: currents, speeds, duty cycles."""
 
 from array import array
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import ScalarSeries
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
-from l2m_gtsam.storage.bag_options import ColumnOptions, RegressorTopic, Stamps
+from l2m_gtsam.storage.bag_options import BagOptions, RegressorTopic
 from l2m_gtsam.storage.clocks import check_stamps
 from l2m_gtsam.storage.field_types import Step, number_at, steps_of
 from l2m_gtsam.storage.log import Message
@@ -30,11 +30,7 @@ class _NumberBuffer:
 
 
 def read_scalars(
-    path: Path,
-    options: Mapping[str, RegressorTopic],
-    stamps: Stamps = Stamps.HEADER,
-    progress: Count | None = None,
-    columns: ColumnOptions | None = None,
+    path: Path, options: BagOptions, progress: Count | None = None
 ) -> tuple[ScalarSeries, ...]:
     """Read the numbers that options name, in one pass; other topics are not decoded.
 
@@ -46,46 +42,42 @@ def read_scalars(
     path
         Bag of any kind.
     options
-        Where each number is found, by its name.
-    stamps
-        Which time of a message counts, as for the readings.
+        Where each number is found, by its name, and which time of a message counts.
     progress
         Called with the messages read and their number.
-    columns
-        Which columns of a CSV file are what, where their names do not say it.
 
     Raises
     ------
     BagError
         The bag, a topic or a field is not usable; the line says what there is instead.
     """
-    if not options:
+    if not options.regressors:
         return ()
-    collected = [_NumberBuffer(name, each, steps_of(each.field)) for name, each in options.items()]
-    with open_log(path, columns) as bag:
-        topics = {_topic(bag, each) for each in collected}
-        connections = [c for c in bag.connections if c.topic.lstrip("/") in topics]
+    collected = [
+        _NumberBuffer(name, each, steps_of(each.field)) for name, each in options.regressors.items()
+    ]
+    with open_log(path, options.columns) as bag:
+        into: dict[int, list[_NumberBuffer]] = {}
+        for each in collected:
+            for connection in _connections(bag, each):
+                into.setdefault(connection.id, []).append(each)
+        connections = [c for c in bag.connections if c.id in into]
         for message in bag.messages(connections, progress):
-            stamp_ns = message.stamp_ns(stamps)
-            for each in collected:
-                if _plain(each.options.topic) == message.connection.topic.lstrip("/"):
-                    _add(path, each, stamp_ns, message)
+            for each in into[message.connection.id]:
+                _add(path, each, message.stamp_ns(options.stamps), message)
     return tuple(_series(path, each) for each in collected)
 
 
-def _plain(topic: str) -> str:
-    return topic.lstrip("/")
-
-
-def _topic(bag: Log, wanted: _NumberBuffer) -> str:
-    """Return a regressor's topic without its leading slash; the bag must have it."""
-    topic = _plain(wanted.options.topic)
-    if all(_plain(c.topic) != topic for c in bag.connections):
+def _connections(bag: Log, wanted: _NumberBuffer) -> list[Connection]:
+    """Return those of a regressor's topic, whatever its leading slash; the bag must have one."""
+    topic = wanted.options.topic
+    found = [c for c in bag.connections if c.topic.lstrip("/") == topic.lstrip("/")]
+    if not found:
         raise BagError(
-            f"{bag.path}: regressor {wanted.name!r}: no topic {wanted.options.topic!r}; there are: "
+            f"{bag.path}: regressor {wanted.name!r}: no topic {topic!r}; there are: "
             f"{listed(bag.connections)}"
         )
-    return topic
+    return found
 
 
 def _add(path: Path, into: _NumberBuffer, stamp_ns: int, message: Message) -> None:

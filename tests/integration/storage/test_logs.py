@@ -276,7 +276,7 @@ def test_topics_of_a_ulog(tmp_path: Path) -> None:
     raw = read_fields(path, BagOptions(fields="sensor_mag"))  # type: ignore[arg-type]
     assert [each.sensor for each in raw] == ["sensor_mag"]
     current = {"motors": RegressorTopic(topic="battery_status", field="current_a")}
-    (motors,) = read_scalars(path, current)
+    (motors,) = read_scalars(path, BagOptions(regressors=current))
     np.testing.assert_array_equal(motors.value, np.arange(COUNT))
     report = inspect_bag(path, BagOptions())
     assert report.obstacles == ()

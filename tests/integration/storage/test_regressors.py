@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import get_types_from_msg
 
 from l2m_gtsam.errors import BagError
-from l2m_gtsam.storage.bag_options import RegressorTopic, Stamps
+from l2m_gtsam.storage.bag_options import BagOptions, RegressorTopic, Stamps
 from l2m_gtsam.storage.regressors import read_scalars
 from tests.drives.bags import KINDS, Entry, Ros, ros, write
 from tests.support.memory import with_peak
@@ -74,10 +74,14 @@ ASKED = {
 }
 
 
+def only(name: str, **topic: Any) -> BagOptions:
+    return BagOptions(regressors={name: RegressorTopic(**topic)})
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_numbers_of_any_type_are_read_in_one_pass(tmp_path: Path, kind: str) -> None:
     path = write(tmp_path, kind, entries(kind))
-    current, speed, duty, duty_0, lamp = read_scalars(path, ASKED)
+    current, speed, duty, duty_0, lamp = read_scalars(path, BagOptions(regressors=ASKED))
     k = np.arange(20)
     assert [current.name, duty_0.name, speed.topic] == ["current", "duty_0", "odom"]
     np.testing.assert_array_equal(current.stamp_ns, START + k * STEP + LATE)  # it has no header
@@ -93,8 +97,9 @@ def test_record_time_by_option(tmp_path: Path) -> None:
     path = write(tmp_path, "mcap", entries("mcap", stamp=0))
     asked = {"speed": ASKED["speed"]}
     with pytest.raises(BagError, match=r"'speed': .*stamps are 0.*`bag.stamps: record`"):
-        read_scalars(path, asked)
-    (speed,) = read_scalars(path, asked, Stamps.RECORD)
+        read_scalars(path, BagOptions(regressors=asked))
+    recorded = BagOptions(regressors=asked, stamps=Stamps.RECORD)
+    (speed,) = read_scalars(path, recorded)
     np.testing.assert_array_equal(speed.stamp_ns, START + np.arange(20) * STEP + LATE)
 
 
@@ -105,7 +110,8 @@ def test_what_is_not_finite_is_dropped_and_order_does_not_matter(tmp_path: Path)
         Entry("/odom", "nav_msgs/Odometry", START + i, odometry(make, START + k * STEP, value))
         for i, (k, value) in enumerate(content)
     ]
-    (speed,) = read_scalars(write(tmp_path, "mcap", found), {"speed": ASKED["speed"]})
+    path = write(tmp_path, "mcap", found)
+    (speed,) = read_scalars(path, BagOptions(regressors={"speed": ASKED["speed"]}))
     np.testing.assert_array_equal(speed.stamp_ns, START + np.array([0, 1, 3]) * STEP)
     np.testing.assert_array_equal(speed.value, [-2.0, 5.0, 1.0])
 
@@ -132,7 +138,7 @@ def test_faults_are_one_line(tmp_path: Path, kind: str, name: str) -> None:
     topic, field, expected = FAULTS[name]
     path = write(tmp_path, kind, entries(kind, 2))
     with pytest.raises(BagError, match=expected) as error:
-        read_scalars(path, {"motor": RegressorTopic(topic=topic, field=field)})
+        read_scalars(path, only("motor", topic=topic, field=field))
     assert str(error.value).startswith(f"{path}: regressor 'motor': ")
     assert "\n" not in str(error.value)
 
@@ -144,8 +150,8 @@ def test_constants_of_a_type_are_no_numbers_of_a_message(tmp_path: Path) -> None
     path = write(tmp_path, "mcap", [Entry("/gps", "sensor_msgs/NavSatStatus", START, message)])
     for field in ("STATUS_FIX", "status.real"):
         with pytest.raises(BagError, match=rf"no '{field}'"):
-            read_scalars(path, {"fix": RegressorTopic(topic="/gps", field=field)})
-    (found,) = read_scalars(path, {"fix": RegressorTopic(topic="/gps", field="service")})
+            read_scalars(path, only("fix", topic="/gps", field=field))
+    (found,) = read_scalars(path, only("fix", topic="/gps", field="service"))
     assert found.value == [1.0]
 
 
@@ -154,8 +160,8 @@ def test_silent_and_senseless_topics(tmp_path: Path) -> None:
     nothing = make("std_msgs/Float64", data=np.nan)
     path = write(tmp_path, "mcap", [Entry("/motor", "std_msgs/Float64", START, nothing)])
     with pytest.raises(BagError, match="topic /motor has no finite 'data'"):
-        read_scalars(path, {"motor": RegressorTopic(topic="/motor")})
-    assert read_scalars(path, {}) == ()
+        read_scalars(path, only("motor", topic="/motor"))
+    assert read_scalars(path, BagOptions()) == ()
 
 
 def test_types_of_ones_own_need_a_definition_in_the_bag(tmp_path: Path) -> None:
@@ -167,12 +173,12 @@ def test_types_of_ones_own_need_a_definition_in_the_bag(tmp_path: Path) -> None:
         message = make("drive_msgs/Motor", current=3.0)
         writer.write(to, START, make.store.serialize_cdr(message, "drive_msgs/msg/Motor"))
     asked = {"motor": RegressorTopic(topic="/motor", field="current")}
-    assert read_scalars(path, asked)[0].value == [3.0]
+    assert read_scalars(path, BagOptions(regressors=asked))[0].value == [3.0]
     with closing(sqlite3.connect(next(path.glob("*.db3")))) as database:
         database.execute("DELETE FROM message_definitions")
         database.commit()
     with pytest.raises(BagError, match=r"drive_msgs/msg/Motor on /motor .*the bag holds none"):
-        read_scalars(path, asked)
+        read_scalars(path, BagOptions(regressors=asked))
 
 
 @pytest.mark.parametrize(
@@ -199,7 +205,7 @@ def test_memory_does_not_grow_with_what_is_not_asked_for(tmp_path: Path) -> None
     big = duties(make, [1.0] * 100_000)
     found = [Entry("/big", "std_msgs/Float64MultiArray", START + k, big) for k in range(30)]
     path = write(tmp_path, "mcap", found)
-    topics = {"first": RegressorTopic(topic="/big", field="data[0]")}
-    (first,), peak = with_peak(lambda: read_scalars(path, topics))
+    first_only = only("first", topic="/big", field="data[0]")
+    (first,), peak = with_peak(lambda: read_scalars(path, first_only))
     assert len(first) == 30
     assert peak < 8e6
