@@ -9,6 +9,7 @@ from pydantic import Field
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings, ScalarSeries, Synchronised
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.options import Options
+from l2m_gtsam.recording.sync import lies_between
 
 STILL = 1e-9  # of its size: a number that varies less follows from rounding
 
@@ -54,29 +55,13 @@ def resampled(
     values = np.zeros((len(stamp_ns), len(series)))
     known = np.ones(len(stamp_ns), dtype=np.bool_)
     for k, each in enumerate(series):
-        near = _is_near(each.stamp_ns, stamp_ns, options.max_gap_s)
-        values[near, k] = _interpolated(each, stamp_ns[near])
+        near = lies_between(each.stamp_ns, stamp_ns, options.max_gap_s)
         known &= near
+        if near.any():
+            # Seconds since 1970 in double precision would keep tenths of a microsecond only.
+            at_s, sample_s = (1e-9 * (ns - each.stamp_ns[0]) for ns in (stamp_ns, each.stamp_ns))
+            values[near, k] = np.interp(at_s[near], sample_s, each.value)
     return Resampled(values, known)
-
-
-def _interpolated(series: ScalarSeries, stamp_ns: IntArray) -> FloatArray:
-    if not len(stamp_ns):
-        return np.empty(0)
-    # Seconds since 1970 in double precision would keep tenths of a microsecond only.
-    start = series.stamp_ns[0]
-    at_s, sample_s = (stamp_ns - start) * 1e-9, (series.stamp_ns - start) * 1e-9
-    return np.asarray(np.interp(at_s, sample_s, series.value))
-
-
-def _is_near(sample_ns: IntArray, stamp_ns: IntArray, max_gap_s: float) -> BoolArray:
-    """Return which times lie on a sample, or between two that are near each other, shape (N,)."""
-    if not len(sample_ns):
-        return np.zeros(len(stamp_ns), dtype=np.bool_)
-    after = np.searchsorted(sample_ns, stamp_ns)
-    on_sample = sample_ns[np.minimum(after, len(sample_ns) - 1)] == stamp_ns
-    gap_s = np.concatenate([[np.inf], np.diff(sample_ns) * 1e-9, [np.inf]])[after]
-    return np.asarray(on_sample | (gap_s <= max_gap_s))
 
 
 def with_regressors(

@@ -220,8 +220,13 @@ def at_poses(readings: Readings, trajectory: Trajectory, offset: FloatArray) -> 
 
 def has_pose(trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float) -> BoolArray:
     """Return which times lie between two poses that are not further apart, shape (N,)."""
-    spanned = _spanned(trajectory.stamp_ns, stamp_ns, 0)
-    return spanned & (longest_gap_ns(trajectory.stamp_ns, stamp_ns) <= max_pose_gap_s * 1e9)
+    return lies_between(trajectory.stamp_ns, stamp_ns, max_pose_gap_s)
+
+
+def lies_between(known_ns: IntArray, stamp_ns: IntArray, max_gap_s: float) -> BoolArray:
+    """Return which times lie between two known ones that are not further apart, shape (N,)."""
+    spanned = _spanned(known_ns, stamp_ns, 0)
+    return spanned & (longest_gap_ns(known_ns, stamp_ns) <= max_gap_s * 1e9)
 
 
 def far_turns(trajectory: Trajectory) -> BoolArray:
