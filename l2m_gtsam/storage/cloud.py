@@ -1,7 +1,6 @@
 """Point clouds: read from files (PCD, PLY, LAS, E57, NPZ), averaged over voxels, written."""
 
 import struct
-import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.errors import MapError, OutputError
+from l2m_gtsam.errors import MapError
 from l2m_gtsam.storage.bounded import ArrayMember, open_archive, opened_array
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.point_table import (
@@ -182,19 +181,17 @@ def write_cloud(path: Path, points: FloatArray) -> None:
     Parameters
     ----------
     path
-        File to write: ``.ply`` (binary, float64) or ``.npz``.
+        File to write: PLY, binary, float64.
     points
         Finite points in metres, shape (N, 3).
 
     Raises
     ------
     OutputError
-        The file is of another kind or cannot be written.
+        The file cannot be written.
     """
-    if path.suffix.lower() not in WRITERS:
-        raise OutputError(f"{path}: a point cloud is written as {' or '.join(WRITERS)}")
     with atomic_path(path) as temporary:
-        WRITERS[path.suffix.lower()](temporary, points)
+        write_ply(temporary, points)
 
 
 def located(points: FloatArray, where: str) -> FloatArray:
@@ -261,13 +258,6 @@ def _array_pieces(path: Path, member: ArrayMember) -> Iterator[FloatArray]:
         yield np.frombuffer(data, dtype=kind).reshape((-1, 3), order=order).astype(np.float64)
 
 
-def _write_npz(path: Path, points: FloatArray) -> None:
-    # A bare ZipInfo has a fixed date: the same cloud gives the same bytes.
-    entry = zipfile.ZipInfo(NPZ_MEMBER)
-    with zipfile.ZipFile(path, "w") as archive, archive.open(entry, "w") as member:
-        np.lib.format.write_array(member, np.asarray(points, order="C"), allow_pickle=False)
-
-
 @contextmanager
 def _translated(path: Path) -> Iterator[None]:
     """Turn what opening and understanding a bad file raises into one line."""
@@ -293,4 +283,3 @@ READERS: dict[str, Callable[[Path], Iterator[FloatArray]]] = {
     ".laz": las_pieces,
     ".e57": e57_pieces,
 }
-WRITERS: dict[str, Callable[[Path, FloatArray], None]] = {".ply": write_ply, ".npz": _write_npz}

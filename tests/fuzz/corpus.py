@@ -157,8 +157,10 @@ def _clouds(folder: Path) -> list[Sound]:
         if name.endswith("pcd"):
             rows = "\n".join(" ".join(map(str, each)) for each in points.tolist())
             (folder / name).write_text(f"{PCD}{rows}\n")
-        else:
+        elif name.endswith("ply"):
             write_cloud(folder / name, points)
+        else:
+            np.savez(folder / name, points=points)
         changes = {**BYTES, "arrays": changed_cloud, "members": changed_archive}
         made = changes if name.endswith("npz") else WORDS
         sounds.append(Sound(f"cloud {name[-4:]}", folder / name, made, ((READ, "cloud", CASE),)))

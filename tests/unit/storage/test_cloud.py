@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from pypcd4.pypcd4 import Encoding, PointCloud
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.errors import MapError, OutputError
+from l2m_gtsam.errors import MapError
 from l2m_gtsam.storage import cloud, point_table
 from l2m_gtsam.storage.cloud import VoxelMeans, read_cloud, thinned_cloud, write_cloud
 
@@ -58,19 +58,27 @@ def ply_header(form: str, points: int, properties: str = "float x,float y,float 
     return f"ply\nformat {form} 1.0\nelement vertex {points}\n{lines}end_header\n"
 
 
+def written_cloud(path: Path, points: FloatArray) -> None:
+    """A cloud of this program, or of numpy."""
+    if path.suffix == ".npz":
+        np.savez(path, points=points)
+    else:
+        write_cloud(path, points)
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".npz"])
 @many_clouds
 @given(points=clouds(METRES))
 def test_what_is_written_reads_back_equal(tmp_path: Path, suffix: str, points: FloatArray) -> None:
     path = tmp_path / f"cloud{suffix}"
-    write_cloud(path, points)
+    written_cloud(path, points)
     np.testing.assert_array_equal(read_cloud(path), points)
 
 
 def test_the_same_cloud_gives_the_same_bytes(tmp_path: Path) -> None:
-    for name in ("a.npz", "b.npz"):
+    for name in ("a.ply", "b.ply"):
         write_cloud(tmp_path / name, POINTS)
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 @pytest.mark.parametrize("encoding", [Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED])
@@ -151,7 +159,7 @@ def test_long_files_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.Monke
     text = "\n".join(f"{x:.3f} {y:.3f} {z:.3f}" for x, y, z in points)
     written(tmp_path / "a.pcd", pcd_header("ascii", 1003) + text)
     for name in ("a.ply", "a.npz"):
-        write_cloud(tmp_path / name, points)
+        written_cloud(tmp_path / name, points)
     for module in (cloud, point_table):
         monkeypatch.setattr(module, "PIECE_POINTS", 100)
     monkeypatch.setattr(point_table, "PIECE_BYTES", 2400)
@@ -167,7 +175,7 @@ def test_long_files_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.Monke
 def test_what_is_not_finite_is_dropped(tmp_path: Path) -> None:
     points = np.array([[np.nan, 0, 0], [1, 2, 3], [0, np.inf, 0], [0, 0, -np.inf]])
     for name in ("a.ply", "a.npz"):
-        write_cloud(tmp_path / name, points)
+        written_cloud(tmp_path / name, points)
         np.testing.assert_array_equal(read_cloud(tmp_path / name), [[1, 2, 3]])
     path = written(tmp_path / "a.pcd", pcd_header("ascii", 2) + "nan nan nan\n1 2 3\n")
     np.testing.assert_array_equal(read_cloud(path), [[1, 2, 3]])
@@ -209,8 +217,6 @@ def test_missing_foreign_and_unknown_files(tmp_path: Path) -> None:
     (tmp_path / "folder.ply").mkdir()
     assert "cannot be read" in complaint(tmp_path / "folder.ply")
     assert ".pcd, .ply, .las" in complaint(written(tmp_path / "a.xyz", "1 2 3"))
-    with pytest.raises(OutputError, match=r"written as \.ply or \.npz"):
-        write_cloud(tmp_path / "a.pcd", POINTS)
     for suffix in ("pcd", "ply", "npz"):
         for content in (b"", b"hello\n", bytes(range(256)) * 600, b"\n" * 300_000):
             assert "not a usable point cloud" in complaint(
@@ -332,7 +338,7 @@ def test_any_changed_byte_gives_one_line_or_points(
             path, Encoding.BINARY_COMPRESSED
         )
     else:
-        write_cloud(path, POINTS)
+        written_cloud(path, POINTS)
     data = bytearray(path.read_bytes())
     data[int(where * len(data))] ^= flip
     path.write_bytes(data)
@@ -354,6 +360,6 @@ def outcome(path: Path) -> tuple[str, FloatArray]:
 @pytest.mark.parametrize("name", ["a.ply", "a.npz"])
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_truncated_files(tmp_path: Path, name: str, share: float) -> None:
-    write_cloud(tmp_path / name, POINTS)
+    written_cloud(tmp_path / name, POINTS)
     data = (tmp_path / name).read_bytes()
     assert "not a usable" in complaint(written(tmp_path / name, data[: int(share * len(data))]))
