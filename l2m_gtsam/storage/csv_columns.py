@@ -1,7 +1,7 @@
 """Which columns of a table are what, by their names or as the options say."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from l2m_gtsam.storage.bag_options import ColumnOptions, TimeUnit
@@ -120,12 +120,20 @@ def column_roles(names: Sequence[str], options: ColumnOptions, stem: str) -> Rol
     bare = "mag" in stem.lower() or _states_tesla(parts, vectors.get("", {}))
     magnetic = {base: axes for base, axes in vectors.items() if _is_magnetic(base, bare)}
     others = {base: axes for base, axes in vectors.items() if base not in magnetic}
+    positions = (
+        tuple(axes[each] for each in "xyz")
+        for base, axes in others.items()
+        if (_last(base) in POSITIONS or base.startswith("p_")) and "w" not in axes
+    )
+    orientations = (
+        tuple(axes[each] for each in "xyzw") for axes in vectors.values() if "w" in axes
+    )
     roles = Roles(
         stamp,
         unit if options.time_unit is TimeUnit.AUTO else options.time_unit,
         _fields(names, parts, magnetic, options, stem),
-        _position(names, others, options),
-        _orientation(names, vectors, options),
+        _chosen(names, options.position, positions),
+        _chosen(names, options.orientation, orientations),
         _left_out(names, parts, axes_of, options),
     )
     _check_stamp(names, roles)
@@ -294,24 +302,8 @@ def _field_unit(name: Name) -> Unit | None:
     return FIELD_UNITS.get(name.unit) or FIELD_UNITS.get(ending)
 
 
-def _position(
-    names: Sequence[str], vectors: Mapping[str, Mapping[str, int]], options: ColumnOptions
+def _chosen(
+    names: Sequence[str], given: Sequence[str] | None, found: Iterable[tuple[int, ...]]
 ) -> tuple[int, ...] | None:
-    if options.position is not None:
-        return _places(names, options.position)
-    for base, axes in vectors.items():
-        likely = _last(base) in POSITIONS or base.startswith("p_")
-        if likely and "w" not in axes:
-            return tuple(axes[each] for each in "xyz")
-    return None
-
-
-def _orientation(
-    names: Sequence[str], vectors: Mapping[str, Mapping[str, int]], options: ColumnOptions
-) -> tuple[int, ...] | None:
-    if options.orientation is not None:
-        return _places(names, options.orientation)
-    for axes in vectors.values():
-        if "w" in axes:
-            return tuple(axes[each] for each in "xyzw")
-    return None
+    """Return the columns that the options give, else the first that were found."""
+    return next(iter(found), None) if given is None else _places(names, given)
