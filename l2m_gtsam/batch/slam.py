@@ -92,7 +92,7 @@ def read_evidence(
         repaired = without_jumps(recording.trajectory, config.slam.jumps)
         steps = scan_odometry(scans, repaired, options.registration.edge, config.slam)
         if mapped is None:
-            loops = find_loop_closures(steps, config.lidar.loops).loops
+            loops = find_loop_closures(steps, config.lidar.loops)
             return Scanned(ScanEvidence(loops=loops))
         return Scanned(ScanEvidence(fixes=_fixes(steps, recording, mapped, config)))
     except LidarError as error:

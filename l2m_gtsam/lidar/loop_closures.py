@@ -1,6 +1,5 @@
 """Loop closures: scans of revisited places, registered on those of earlier visits."""
 
-from collections import Counter
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -37,22 +36,6 @@ class LoopOptions(Options):
 
 
 @dataclass(frozen=True)
-class LoopClosureSearch:
-    """Loop closures of a drive.
-
-    Attributes
-    ----------
-    loops
-        Those that are believed, in order of time.
-    refused
-        How many others were compared, by reason.
-    """
-
-    loops: tuple[LoopClosure, ...]
-    refused: dict[Refusal, int]
-
-
-@dataclass(frozen=True)
 class KeyScan:
     """A scan as it is kept.
 
@@ -83,8 +66,8 @@ class KeyScan:
         return Surface(self.points.astype(np.float64))
 
 
-def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopClosureSearch:
-    """Search a drive for loop closures.
+def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> tuple[LoopClosure, ...]:
+    """Return the loop closures of a drive that are believed, in order of time.
 
     Memory grows with the path, by about 0.1 MB for each scan that is kept.
 
@@ -95,7 +78,7 @@ def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopC
     options
         Where to search, and what to believe.
     """
-    kept, loops, refused = list[KeyScan](), list[LoopClosure](), Counter[Refusal]()
+    kept, loops = list[KeyScan](), list[LoopClosure]()
     path, last = 0.0, None
     for step in steps:
         path += float(np.linalg.norm(step.step.t))
@@ -109,10 +92,8 @@ def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopC
             closed = completed(work)
             if isinstance(closed, LoopClosure):
                 loops.append(closed)
-            else:
-                refused[closed] += 1
         kept.append(here)
-    return LoopClosureSearch(tuple(loops), dict(refused))
+    return tuple(loops)
 
 
 def candidates(kept: Sequence[KeyScan], here: KeyScan, options: LoopOptions) -> list[int]:

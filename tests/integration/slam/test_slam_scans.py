@@ -153,7 +153,7 @@ def test_loops_of_scans_help_where_nothing_is_mapped() -> None:
     rng, truth = np.random.default_rng(6), drive.truth
     seen = scanned(truth)
     steps = scan_odometry(scans(ROOM, seen, rng), mended(drive), 0.25, OPTIONS)
-    loops = ScanEvidence(loops=find_loop_closures(steps, LoopOptions()).loops)
+    loops = ScanEvidence(loops=find_loop_closures(steps, LoopOptions()))
     assert len(loops) > 10
     # Tiles that are a little larger than by default, and fewer key poses: a third of the time.
     coarse = {"tiles": TileOptions(core=4.0, modes=100), "key_poses": FAR_APART}
@@ -173,7 +173,7 @@ def test_a_corridor_closes_no_loop() -> None:
     seen = scanned(drive.truth)
     found = scans(CORRIDOR, replace(seen, p=seen.p * [1.0, 0.3, 1.0]), np.random.default_rng(7))
     steps = scan_odometry(found, mended(drive), 0.25, OPTIONS)
-    assert find_loop_closures(steps, LoopOptions()).loops == ()
+    assert find_loop_closures(steps, LoopOptions()) == ()
 
 
 def test_scans_are_fixes_on_line_and_one_that_lies_is_left_out(
