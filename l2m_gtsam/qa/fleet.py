@@ -253,10 +253,11 @@ def verdict_histories(rows: Sequence[FleetRow]) -> tuple[VerdictHistory, ...]:
 
 def _history(vehicle: str, rows: Sequence[FleetRow]) -> VerdictHistory:
     own = [row for row in rows if row.vehicle == vehicle]
-    drives = sorted({(row.date, row.bag) for row in own})
-    levels = {
-        (row.sensor.sensor, row.date, row.bag): row.verdict for row in own if row.sensor is not None
-    }
-    names = sorted({name for name, _, _ in levels})
-    sensors = tuple((name, tuple(levels.get((name, *drive)) for drive in drives)) for name in names)
-    return VerdictHistory(vehicle, tuple((bag, date) for date, bag in drives), sensors)
+    # Drives may have one name and, of clocks that were never set, one date: folders differ.
+    drives = sorted({(row.date, row.bag, row.folder) for row in own})
+    levels = {(each.sensor.sensor, each.folder): each.verdict for each in own if each.sensor}
+    names = sorted({name for name, _ in levels})
+    sensors = tuple(
+        (name, tuple(levels.get((name, folder)) for _, _, folder in drives)) for name in names
+    )
+    return VerdictHistory(vehicle, tuple((bag, date) for date, bag, _ in drives), sensors)
