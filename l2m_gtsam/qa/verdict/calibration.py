@@ -326,6 +326,8 @@ class Measured:
         Where the verdict changes.
     passes
         Why it passes although it is above a limit, as a phrase; else empty.
+    undetermined
+        What it leads to where it is not determined, as in ``ending``.
     """
 
     name: str
@@ -334,12 +336,15 @@ class Measured:
     warn: float
     fail: float
     passes: str
+    undetermined: Level
 
     @property
     def level(self) -> Level:
         """What it leads to by itself."""
+        if self.passes:
+            return Level.PASS
         by_value = Limit(warn=self.warn, fail=self.fail).level(self.value)
-        return Level.PASS if self.passes else by_value
+        return self.undetermined if np.isinf(self.value) else by_value
 
 
 def measured(
@@ -361,7 +366,10 @@ def measured(
     every = (
         _in("sigma of t", "mm", _largest(sensor.t_sigma), options.position_sigma_m, 1e3),
         _in("sigma of rotation", "°", _largest(turned), options.rotation_sigma_deg),
-        _in("sigma of H", "µT", _largest(sensor.H_sigma), options.hard_iron_sigma_ut),
+        replace(
+            _in("sigma of H", "µT", _largest(sensor.H_sigma), options.hard_iron_sigma_ut),
+            undetermined=Level.WARN,
+        ),
         _in("unexplained by the map", "", found.fit.unexplained, options.unexplained),
         _in("chi-square", "", chi2, options.chi_square),
         _in("halves apart, over what chance allows", "", apart, options.halves_apart, 1.0, passes),
@@ -375,7 +383,8 @@ def measured(
 def _in(
     name: str, unit: str, value: float, limit: Limit, factor: float = 1.0, passes: str = ""
 ) -> Measured:
-    return Measured(name, unit, factor * value, factor * limit.warn, factor * limit.fail, passes)
+    limits = (factor * limit.warn, factor * limit.fail)
+    return Measured(name, unit, factor * value, *limits, passes, undetermined=Level.FAIL)
 
 
 def _largest(sigmas: FloatArray) -> float:
