@@ -48,7 +48,7 @@ LEGEND = {
     "steps": "mean square of the whitened differences between steps of the poses and odometry's",
     "truth": "errors against a trajectory that was given, nothing aligned; expected nees: 6",
     "start": "candidates for the start of the drive over the whole map, the likeliest first; "
-    "margin: log likelihood ratio of the first and the second, null without a second",
+    "margin: log likelihood ratio of the first and the second, NaN without a second",
 }
 
 Content = TypeVar("Content")

@@ -2,13 +2,16 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.storage.record_files import read_slam
+from l2m_gtsam.records.localisation import StartVerdict
+from l2m_gtsam.records.localisation_file import StartRecord
+from l2m_gtsam.storage.record_files import read_slam, write_slam
 
 Edit = Callable[[dict[str, Any]], None]
 
@@ -56,3 +59,14 @@ def test_poses_that_can_be_none(tmp_path: Path, repository: Path, edit: Edit, to
     path.write_text(json.dumps(content))
     with pytest.raises(CalibrationError, match=told):
         read_slam(path)
+
+
+def test_a_start_without_a_second_has_the_margin_that_the_legend_says(
+    tmp_path: Path, repository: Path
+) -> None:
+    found = read_slam(repository / "tests" / "files" / "slam.json")
+    start = StartRecord(StartVerdict.UNIQUE, "found", float("nan"), 9.0, 90, 12, ())
+    path = tmp_path / "slam.json"
+    write_slam(path, replace(found, start=start))
+    content = json.loads(path.read_text())
+    assert f"{content['start']['margin']} without a second" in content["legend"]["start"]
