@@ -171,13 +171,16 @@ def _length(error: np.floating, sigma: np.floating) -> tuple[str, str]:
 
 def consistency_note(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> str:
     """Return how the errors of all positions compare with their sigmas, as a sentence."""
+    pairs = [(result[known.sensor], known.t_lidar_mag) for known in truth]
     ratios = [
-        (result[known.sensor].t_lidar_mag - known.t_lidar_mag) / result[known.sensor].t_sigma
-        for known in truth
-        if result[known.sensor].residuals is not None
+        float(error / sigma)
+        for sensor, t in pairs
+        if sensor.residuals is not None
+        for error, sigma in zip(sensor.t_lidar_mag - t, sensor.t_sigma, strict=True)
+        if np.isfinite(sigma)
     ]
     if not ratios:
-        return "no sensor was solved"
+        return "no position was determined"
     rms = float(np.sqrt(np.mean(np.square(ratios))))
     return f"errors of t are {rms:.1f} times their sigmas (rms, expected 1)"
 

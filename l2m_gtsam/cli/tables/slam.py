@@ -112,7 +112,7 @@ def truth_lines(truth: TruthRecord | None) -> tuple[str, ...]:
     errors = (
         f"against the truth at {truth.poses} key poses: odometry {1e3 * before.rms_m:.0f} mm rms, "
         f"{1e3 * before.largest_m:.0f} mm at most; {_scanned(truth)}localised "
-        f"{1e3 * after.rms_m:.0f} mm rms, {1e3 * after.largest_m:.0f} mm at most ({_gone(truth)})"
+        f"{1e3 * after.rms_m:.0f} mm rms, {1e3 * after.largest_m:.0f} mm at most{_gone(truth)}"
     )
     nees = (
         f"rotations {before.rms_deg:.2f} deg rms before, {after.rms_deg:.2f} deg after; NEES of "
@@ -130,4 +130,6 @@ def _scanned(truth: TruthRecord) -> str:
 
 def _gone(truth: TruthRecord) -> str:
     gone = truth.removed
-    return f"{gone:.0%} less" if gone >= 0 else f"{-gone:.0%} more"
+    if np.isnan(gone):  # odometry is the truth itself
+        return ""
+    return f" ({abs(gone):.0%} {'less' if gone >= 0 else 'more'})"
