@@ -1,6 +1,7 @@
 """Recorded drives localised on line: message by message, as on a vehicle."""
 
 import resource
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -163,7 +164,7 @@ def slam_online(
         tuple(each for each in run.lines if each.event is not None),
         np.array(run.cost_s),
         NS * float(stamps[-1] - max(int(stamps[0]), begun.after_ns)),
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        peak_mib(),
         None
         if truth is None
         else _compared(truth, trajectory, recording, config, from_first=from_first),
@@ -172,6 +173,12 @@ def slam_online(
             *(() if saved is None or field_map is None else map_notes(saved, field_map)),
         ),
     )
+
+
+def peak_mib() -> float:
+    """Return the most memory that the process has had; macOS counts it in bytes, Linux in KiB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
 @dataclass(frozen=True)
