@@ -75,7 +75,13 @@ def load_map(path: str | Path) -> FieldMap:
     return SavedMap.read(path_of("path", path)).open(silent)
 
 
-def save_map(path: str | Path, field_map: FieldMap, *, frame: str | None = None) -> None:
+def save_map(
+    path: str | Path,
+    field_map: FieldMap,
+    *,
+    frame: str | None = None,
+    source: str | Path | None = None,
+) -> None:
     """Write a map to a file (`.npz`) that the commands read.
 
     Parameters
@@ -86,16 +92,25 @@ def save_map(path: str | Path, field_map: FieldMap, *, frame: str | None = None)
         The map.
     frame
         Name of the frame that it is in; that of its survey's poses if absent.
+    source
+        File that the map was loaded from: what that says of bags, dates and suite, and the LiDAR's
+        cloud, is written, too.
 
     Raises
     ------
     InputError
         It is no map.
+    MapError
+        The source is none.
     OutputError
         The file cannot be written.
     """
     file = path_of("path", path)
     check(WHOLE_MAP, field_map=field_map)
-    named = frame or frame_of(field_map) or "map"
-    provenance = {"frame": named, "version": version("l2m-gtsam")}
-    write_map(file, field_map, provenance, None)
+    named = {"frame": frame or frame_of(field_map) or "map"}
+    if source is None:
+        write_map(file, field_map, {"version": version("l2m-gtsam"), **named}, None)
+        return
+    before = SavedMap.read(path_of("source", source)).state
+    own = field_map.to_state().provenance
+    write_map(file, field_map, {**before.provenance, **own, **named}, before.lidar)
