@@ -5,8 +5,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from l2m_gtsam.batch.drives import (
     CALIBRATION_FILE,
     METRICS_FILE,
@@ -15,9 +13,8 @@ from l2m_gtsam.batch.drives import (
 )
 from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.batch.printing import print_page
-from l2m_gtsam.config import load_config
-from l2m_gtsam.errors import CalibrationError, ConfigError, OutputError
-from l2m_gtsam.options import first_fault
+from l2m_gtsam.config import Config, load_config
+from l2m_gtsam.errors import CalibrationError, OutputError
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.calibration_page import STAGE, calibration_page
@@ -68,12 +65,7 @@ def report_localisation(folder: Path, config: Path | None, page: Path) -> Report
 
     source = folder / SLAM_FILE
     found = read_slam(source)
-    if config is not None:
-        options = load_config(config).qa
-    elif found.judgement is not None:
-        options = saved_options(source, found.judgement.thresholds, QaOptions)
-    else:
-        options = saved_options(source, found.options, QaOptions, "qa")
+    options = _limits(source, found, None if config is None else load_config(config))
     judgement = judgement_of_localisation(found, options)
     record = replace(found, judgement=judgement)
     with published(folder, adds=True) as stage:
@@ -180,14 +172,10 @@ def report_calibration(
     Raises
     ------
     L2MError
-        The report cannot be written, or the folder holds a localisation, too; one line.
+        The report cannot be written; one line.
     """
     progress(STAGE, 0.0)
-    check_outputs(folder / REPORT_FILE)
-    holds_localisation(folder)
-    written = folder / CALIBRATION_FILE
-    source = source_file(written) if written.exists() else None
-    identity = Identity(found.result.report_id, source) if source else None
+    identity = Identity(found.result.report_id, source_file(folder / CALIBRATION_FILE))
     verdict = write_report(folder, found.result, found.metrics, options, progress, identity)
     progress(STAGE, 1.0)
     return verdict
@@ -226,7 +214,7 @@ def _report_calibration(folder: Path, config: Path | None, progress: Progress) -
             f"(report {found.report_id[:SHOWN]}), or was changed; restore it, or calibrate again"
         )
     given = None if config is None else load_config(config)
-    options = _saved(found) if given is None else given.qa
+    options = _limits(source, found, given)
     if given is not None and given.report:
         found = replace(found, options={**found.options, ENTRIES: given.report})
     check_names([each.sensor for each in found.sensors], options)
@@ -253,25 +241,21 @@ def write_report(
 
     Raises
     ------
-    ConfigError
-        The options name a sensor that is not there.
     OutputError
         It cannot be written.
     """
-    check_names([each.sensor for each in result.sensors], options)
     page = calibration_page(result, metrics, options, progress, identity)
     with published(folder, REPORT_FILE, adds=True) as stage:
         write_text(stage / REPORT_FILE, page)
     return judge(result, metrics, options)
 
 
-def _saved(result: CalibrationResult) -> QaOptions:
-    """Return the thresholds that a calibration was judged by, else those that it was made with."""
-    judged, made = result.judgement, result.options.get("qa", {})
-    try:
-        return QaOptions.model_validate(made if judged is None else judged.thresholds)
-    except ValidationError as error:
-        fault = first_fault(error, "qa")
-        raise ConfigError(
-            f"{CALIBRATION_FILE}: options: {fault}; give thresholds with --config"
-        ) from error
+def _limits(
+    source: Path, found: CalibrationResult | LocalisationRecord, given: Config | None
+) -> QaOptions:
+    """Return the thresholds given, else those that a result was judged by, or was made with."""
+    if given is not None:
+        return given.qa
+    if found.judgement is not None:
+        return saved_options(source, found.judgement.thresholds, QaOptions)
+    return saved_options(source, found.options, QaOptions, "qa")

@@ -13,6 +13,7 @@ from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, EvaluatedCali
 from l2m_gtsam.batch.reports import (
     REPORT_FILE,
     SLAM_FILE,
+    calibration_results,
     report_calibration,
     report_folder,
     write_report,
@@ -97,18 +98,18 @@ def test_metrics_come_back_as_they_were(made: Made, tmp_path: Path) -> None:
 def test_what_was_just_written_is_reported_without_being_read(
     made: Made, reported: tuple[Level, str], tmp_path: Path
 ) -> None:
-    """The same page as of its folder, which has no bag and no map.
-
-    And the same refusal beside a localisation.
-    """
+    """The same page as of its folder, which has no bag and no map."""
     shutil.copy(made.folder / CALIBRATION_FILE, tmp_path)
     found = EvaluatedCalibration(read_calibration(made.folder / CALIBRATION_FILE), made.metrics)
     assert report_calibration(tmp_path, found, QaOptions()).level is reported[0]
     assert (tmp_path / REPORT_FILE).read_text() == reported[1]
+
+
+def test_a_calibration_beside_a_localisation_is_refused(tmp_path: Path) -> None:
     for name in (METRICS_FILE, SLAM_FILE):
         (tmp_path / name).touch()
-    with pytest.raises(OutputError, match="one report each"):
-        report_calibration(tmp_path, found, QaOptions())
+    with pytest.raises(OutputError, match="one report each"), calibration_results(tmp_path):
+        pytest.fail("there can be one report only")
 
 
 def test_the_page_has_all_that_a_person_looks_for(reported: tuple[Level, str]) -> None:
