@@ -1,7 +1,7 @@
 """Arguments of another kind than is wanted: one line says which, what came, and what is wanted."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,13 +18,6 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.text import shown, shown_value
 
 Model = TypeVar("Model", bound=Options)
-READERS = {
-    "recording": "read_bag",
-    "surveys": "read_bag",
-    "drives": "read_bag",
-    "field_map": "load_map",
-    "calibration": "read_calibration",
-}
 
 
 @dataclass(frozen=True)
@@ -37,10 +30,13 @@ class Kind:
         In words.
     fits
         Whether a value is that.
+    reader
+        Function that reads it from a file; empty where a path is not mistaken for it.
     """
 
     wanted: str
     fits: Callable[[Any], bool]
+    reader: str = ""
 
 
 def _has(*names: str) -> Callable[[Any], bool]:
@@ -53,12 +49,14 @@ ASKED = _has("query", "field_and_gradient")
 DRIVE = Kind(
     "a drive, made by `l2m_gtsam.read_bag` or `l2m_gtsam.drive`",
     lambda value: isinstance(value, Recording),
+    "read_bag",
 )
-MAP = Kind("a map, made by `l2m_gtsam.build_map` or `l2m_gtsam.load_map`", ASKED)
-WHOLE_MAP = Kind(MAP.wanted, _has("query", "field_and_gradient", "to_state"))
+MAP = Kind("a map, made by `l2m_gtsam.build_map` or `l2m_gtsam.load_map`", ASKED, "load_map")
+WHOLE_MAP = replace(MAP, fits=_has("query", "field_and_gradient", "to_state"))
 CALIBRATION = Kind(
     "a calibration, made by `l2m_gtsam.calibrate` or `l2m_gtsam.read_calibration`",
     lambda value: isinstance(value, JudgedCalibration | CalibrationResult),
+    "read_calibration",
 )
 SENSOR = Kind(
     "a sensor, made by `l2m_gtsam.known_sensor`", lambda value: isinstance(value, KnownSensor)
@@ -84,8 +82,10 @@ def came(value: object) -> str:
     return f"the class {name}" if isinstance(value, type) else f"{article} {name}"
 
 
-def refused(name: str, value: object, wanted: str) -> InputError:
-    """Return the error of an argument that is not what is wanted."""
+def refused(name: str, value: object, wanted: str, reader: str = "") -> InputError:
+    """Return the error of an argument that is not what is wanted, or the path of such a thing."""
+    if reader and PATH.fits(value):
+        return InputError(f"{name}: {str(value)!r} is a path; `l2m_gtsam.{reader}` reads it")
     return InputError(f"{name}: {shown(came(value))} was given; needed is {wanted}")
 
 
@@ -93,24 +93,7 @@ def check(kind: Kind, **given: Any) -> None:
     """Raise an InputError for the first argument that is of another kind."""
     for name, value in given.items():
         if not kind.fits(value):
-            raise refused(name, value, kind.wanted)
-
-
-def refuse_paths(**given: Any) -> None:
-    """Refuse paths, and lists of them, in place of what is read from them.
-
-    Raises
-    ------
-    InputError
-        It says which function reads the file.
-    """
-    for name, value in given.items():
-        paths = value if isinstance(value, list | tuple) else [value]
-        for path in paths:
-            if PATH.fits(path):
-                raise InputError(
-                    f"{name}: {str(path)!r} is a path; `l2m_gtsam.{READERS[name]}` reads it"
-                )
+            raise refused(name, value, kind.wanted, kind.reader)
 
 
 def drives_of(name: str, value: Recording | Sequence[Recording]) -> list[Recording]:
@@ -183,7 +166,7 @@ def _all_of(kind: Kind, wanted: str, name: str, value: Any) -> list[Any]:
     several = isinstance(value, Iterable) and not isinstance(value, str | Mapping | np.ndarray)
     listed = list(value) if several and not ASKED(value) else []
     if not listed:
-        raise refused(name, value, wanted)
+        raise refused(name, value, wanted, kind.reader)
     for index, each in enumerate(listed):
         check(kind, **{f"{name}[{index}]": each})
     return listed

@@ -17,7 +17,6 @@ from l2m_gtsam.api.arguments import (
     check,
     drives_of,
     options_of,
-    refuse_paths,
     refused,
     sensors_of,
 )
@@ -83,7 +82,6 @@ def build_map(
     L2MError
         Whatever is wrong with the input, in one line.
     """
-    refuse_paths(surveys=surveys)
     drives, known = drives_of("surveys", surveys), _sensors(suite)
     chosen = options_of(MappingOptions, options, "mapping")
     if structure is not None:
@@ -122,7 +120,6 @@ def keep_map_up(
     L2MError
         Whatever is wrong with the input, in one line.
     """
-    refuse_paths(field_map=field_map, drives=drives)
     check(WHOLE_MAP, field_map=field_map)
     every, known = drives_of("drives", drives), _sensors(suite)
     if known is None:
@@ -183,7 +180,6 @@ def calibrate(
     L2MError
         Whatever is wrong with the input, in one line.
     """
-    refuse_paths(recording=recording, field_map=field_map)
     check(DRIVE, recording=recording)
     check(MAP, field_map=field_map)
     chosen = options_of(CalibrationOptions, options, "calibration")
@@ -224,7 +220,6 @@ def localise(
     L2MError
         Whatever is wrong with the input, in one line.
     """
-    refuse_paths(recording=recording, calibration=calibration, field_map=field_map)
     check(DRIVE, recording=recording)
     check(CALIBRATION, calibration=calibration)
     chosen = options_of(SlamOptions, options, "slam")
