@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from l2m_gtsam.data import FloatArray, IntArray
 
+EXACT = 1e-12  # of the largest variance, in units of sigmas: a direction without an error
 LEFT_OUT = 1e-6  # of the least eigenvalue that is looked for
 ROWS = 192  # of a block: enough for a fast product, few enough to be of one place
 Product = Callable[[FloatArray], FloatArray]
@@ -57,6 +58,17 @@ def information_root(covariance: FloatArray, sigma: FloatArray, least: float) ->
     """
     values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
     return np.asarray((vectors / np.sqrt(np.maximum(values, least))).T / sigma)
+
+
+def sound_information_root(covariance: FloatArray) -> FloatArray:
+    """Return W with ``W^T W`` the pseudo-inverse of a covariance, shape (r, n).
+
+    A row for each direction that is no more exact, in units of sigmas, than rounding lets it be.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    sound = values > EXACT * values[-1]
+    return np.asarray((vectors[:, sound] / np.sqrt(values[sound])).T / sigma)
 
 
 def triangular_information_root(covariance: FloatArray, ridge: float) -> FloatArray:

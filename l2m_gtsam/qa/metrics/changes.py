@@ -25,9 +25,9 @@ from l2m_gtsam.records.validation import (
 )
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.solve.chi_square import chance_beyond, noticed_sigmas
+from l2m_gtsam.solve.linear_algebra import sound_information_root
 
 MISSED = 0.01  # of changes that are called detectable
-TINY = 1e-12  # of the largest variance, in units of sigmas: a direction that both share exactly
 INDEPENDENT = (
     "The errors of both calibrations count as independent: the covariance of their difference is "
     "the sum of both."
@@ -89,11 +89,8 @@ class CalibrationDifference:
         touched = np.abs(basis).max(axis=1) > 0
         if not known[touched].all():
             return float("inf")
-        sigma = self.sigma[known]
-        S = self.covariance[np.ix_(known, known)] / np.outer(sigma, sigma)
-        columns = basis[known] / sigma[:, None]
-        information = columns.T @ np.linalg.pinv(S, rcond=TINY, hermitian=True) @ columns
-        least = float(np.linalg.eigvalsh(information)[0])
+        seen = sound_information_root(self.covariance[np.ix_(known, known)]) @ basis[known]
+        least = float(np.linalg.eigvalsh(seen.T @ seen)[0])
         sigmas = noticed_sigmas(int(known.sum()), chance, MISSED)
         return sigmas / least**0.5 if least > 0 else float("inf")
 
@@ -110,14 +107,10 @@ class CalibrationDifference:
         if not sigma.all():
             same = not self.value[known][sigma == 0].any()
             return ChangeTest(name, 0.0, 0, 1.0) if same else ChangeTest(name, np.inf, 1, 0.0)
-        # Wald's test, in units of sigmas; directions that both share exactly carry no information.
-        d = self.value[known] / sigma
-        S = self.covariance[np.ix_(known, known)] / np.outer(sigma, sigma)
-        values, axes = np.linalg.eigh(S)
-        sound = values > TINY * values[-1]
-        squared = float(np.sum((axes.T @ d)[sound] ** 2 / values[sound]))
-        freedom = int(sound.sum())
-        return ChangeTest(name, squared, freedom, float(chance_beyond(squared, freedom)))
+        # Wald's test; directions that both share exactly carry no information.
+        W = sound_information_root(self.covariance[np.ix_(known, known)])
+        squared = float(np.sum((W @ self.value[known]) ** 2))
+        return ChangeTest(name, squared, len(W), float(chance_beyond(squared, len(W))))
 
 
 def compare_calibrations(

@@ -11,8 +11,8 @@ from l2m_gtsam.data import BoolArray, Distortion, FloatArray, IntArray
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.records.repeatability import DriveRepeat, GroupDistance, Halves, Repeatability
 from l2m_gtsam.solve.chi_square import quantile
+from l2m_gtsam.solve.linear_algebra import sound_information_root
 
-TINY = 1e-12  # relative to the largest, of variances in units of useful sigmas
 BAND = 0.95
 GROUPS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15)}
 SEVERAL = "several drives are compared with each other instead of halves of one"
@@ -109,13 +109,8 @@ def _judged(difference: FloatArray, covariance: FloatArray, turned_deg: float) -
 
 def _squared(difference: FloatArray, covariance: FloatArray, taken: BoolArray) -> tuple[float, int]:
     """Return the squared distance of some parameters in sigmas, and of how many directions."""
-    d, S = difference[taken], covariance[np.ix_(taken, taken)]
-    # In units of sigmas, so that metres and microtesla are alike; along principal axes.
-    scale = np.sqrt(np.diag(S))
-    values, axes = np.linalg.eigh(S / np.outer(scale, scale))
-    sound = values > TINY * values[-1]
-    along = (axes.T @ (d / scale))[sound] / np.sqrt(values[sound])
-    return float(along @ along), int(sound.sum())
+    along = sound_information_root(covariance[np.ix_(taken, taken)]) @ difference[taken]
+    return float(along @ along), len(along)
 
 
 def _turned(first: FloatArray, second: FloatArray) -> float:
@@ -182,11 +177,8 @@ def common(parts: Sequence[PartialEstimate]) -> CommonEstimate:
     kept = [np.flatnonzero(part.known) for part in parts]
     y = np.concatenate([part.vector[at] for part, at in zip(parts, kept, strict=True)])
     S = _covariance(parts, kept)
-    scale = np.sqrt(np.diag(S))
-    values, axes = np.linalg.eigh(S / np.outer(scale, scale))
-    sound = values > TINY * values[-1]
-    # W^T W = S^+: parts that share all errors of a direction count once (Aitken's estimator).
-    W = (axes[:, sound] / np.sqrt(values[sound])).T / scale
+    # Parts that share all errors of a direction count once (Aitken's estimator).
+    W = sound_information_root(S)
     found = np.unique(np.concatenate(kept))
     A = np.concatenate([np.eye(15)[at] for at in kept])[:, found]
     # Columns in units of sigmas, so that the pseudo-inverse cuts metres and microtesla alike.
@@ -202,7 +194,7 @@ def common(parts: Sequence[PartialEstimate]) -> CommonEstimate:
         rows = [part.shared_root[at] for part, at in zip(parts, kept, strict=True)]  # type: ignore[index]
         root = np.zeros((15, rows[0].shape[1]))
         root[found] = by_y @ np.concatenate(rows)
-    freedom = max(int(sound.sum()) - len(found), 0)
+    freedom = max(len(W) - len(found), 0)
     return CommonEstimate(PartialEstimate(vector, covariance, root), float(left @ left), freedom)
 
 

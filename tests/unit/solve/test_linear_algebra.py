@@ -14,6 +14,7 @@ from l2m_gtsam.solve.linear_algebra import (
     leading_eigenvectors,
     lower_information_root,
     right_divided,
+    sound_information_root,
     submatrix,
     triangular_information_root,
     triangular_rows,
@@ -55,6 +56,15 @@ def test_a_direction_that_is_exact_keeps_the_least_variance() -> None:
     P = np.diag([4.0, 0.0])
     W = information_root(P, np.array([2.0, 1e-3]), 1e-4)
     np.testing.assert_allclose(W.T @ W, np.diag([0.25, 1e10]), rtol=1e-12)
+
+
+def test_an_exact_direction_has_no_row_of_a_sound_root() -> None:
+    sigma = np.array([1e-3, 1e-3, 10.0])
+    S = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) * np.outer(sigma, sigma)
+    W = sound_information_root(S)
+    assert W.shape == (2, 3)
+    np.testing.assert_allclose(W @ S @ W.T, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(S @ W.T @ W @ S, S, rtol=1e-12)
 
 
 def test_correlations_are_factored() -> None:
