@@ -117,12 +117,14 @@ LIMITS = {"gt": "> {}", "ge": "≥ {}", "lt": "< {}", "le": "≤ {}"}
 def pages() -> dict[str, str]:
     """Return the pages in Markdown, a table for every model, by their paths in the docs."""
     return {
-        path: GENERATED + head + "".join(_sections(model, "", model()))
+        path: GENERATED
+        + head
+        + "".join(_sections(model, "", model().model_dump(mode="json", by_alias=True)))
         for path, (head, model) in PAGES.items()
     }
 
 
-def _sections(model: type[BaseModel], prefix: str, values: BaseModel | None) -> Iterator[str]:
+def _sections(model: type[BaseModel], prefix: str, values: dict[str, Any]) -> Iterator[str]:
     """Yield the table of a model, then those of the models inside it.
 
     Defaults are those of the place where a model stands, which may differ from the model's own.
@@ -142,16 +144,17 @@ def _sections(model: type[BaseModel], prefix: str, values: BaseModel | None) -> 
         yield f"- [`{key}`](#{key}): {_text(meanings(model).get(name, ''))}\n"
     for name, inside in below.items():
         key = f"{prefix}.{name}{inside.through}".lstrip(".")
-        value = getattr(values, name, None)
-        yield from _sections(inside.model, key, value if isinstance(value, BaseModel) else None)
+        value = None if inside.through else values.get(name)
+        yield from _sections(inside.model, key, value or {})
 
 
-def _row(model: type[BaseModel], name: str, values: BaseModel | None) -> str:
+def _row(model: type[BaseModel], name: str, values: dict[str, Any]) -> str:
     field = model.model_fields[name]
     kind = _cell(kind_of(field.annotation) + limits_of(field))
-    default = "required" if field.is_required() else f"`{_cell(_default(field, name, values))}`"
+    key, own = field.alias or name, field.get_default(call_default_factory=True)
+    default = "required" if field.is_required() else f"`{_cell(_plain(values.get(key, own)))}`"
     meaning = _text(meanings(model).get(name, ""))
-    return f"| `{field.alias or name}` | {kind} | {default} | {meaning} |\n"
+    return f"| `{key}` | {kind} | {default} | {meaning} |\n"
 
 
 @dataclass(frozen=True)
@@ -213,20 +216,6 @@ def limits_of(field: FieldInfo) -> str:
         if isinstance(getattr(each, name, None), int | float)
     ]
     return f", {', '.join(found)}" if found else ""
-
-
-def _default(field: FieldInfo, name: str, values: BaseModel | None) -> str:
-    own = field.get_default(call_default_factory=True)
-    value = getattr(values, name) if values is not None else own
-    if value is None:
-        return "null"
-    if isinstance(value, enum.Enum):
-        return str(value.value)
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(str, value))}]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _text(text: str) -> str:
