@@ -106,10 +106,8 @@ class JudgedCalibration(Shown):
             **_axes("sigma_t_{}_m", sensor.t_sigma),
             **_axes("H_{}_ut", sensor.distortion.H),
             **_axes("sigma_H_{}_ut", sensor.H_sigma),
-            **_axes("rotation_{}_deg", _turn_deg(sensor.R_lidar_mag)),
-            **_axes(
-                "sigma_rotation_{}_deg", np.degrees(np.sqrt(np.diag(sensor.rotation_covariance)))
-            ),
+            **_axes("rotation_{}_deg", np.rad2deg(sensor.rotation_vector)),
+            **_axes("sigma_rotation_{}_deg", sensor.turn_sigma_deg),
             "time_offset_s": 0.0 if offset is None else offset.seconds,
             "noise_ut": sensor.noise,
             "readings": sensor.used,
@@ -176,13 +174,6 @@ class LocalisedDrive(Shown):
 
 def _axes(name: str, values: Sequence[float] | Any) -> Row:
     return {name.format(axis): float(v) for axis, v in zip("xyz", values, strict=True)}
-
-
-def _turn_deg(R_lidar_mag: Any) -> Any:
-    """Return a rotation as a rotation vector in degrees, shape (3,); NaN where there is none."""
-    if not np.isfinite(R_lidar_mag).all():
-        return np.full(3, np.nan)
-    return Rotation.from_matrix(R_lidar_mag).as_rotvec(degrees=True)
 
 
 def _text(value: Any) -> str:

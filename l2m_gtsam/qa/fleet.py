@@ -30,7 +30,6 @@ def sensor_rows(result: CalibrationResult, verdict: Verdict) -> tuple[SensorRow,
 
 def _row(sensor: SensorCalibration, own: SensorVerdict, shared: tuple[Reason, ...]) -> SensorRow:
     verdict = SensorVerdict.of(sensor.sensor, [*own.reasons, *shared])
-    rotation_sigma = np.rad2deg(np.sqrt(np.diag(sensor.rotation_covariance)))
     figures, H = sensor.residuals, sensor.distortion.H
     return SensorRow(
         sensor=sensor.sensor,
@@ -39,7 +38,7 @@ def _row(sensor: SensorCalibration, own: SensorVerdict, shared: tuple[Reason, ..
         t=row(sensor.t_lidar_mag, DIGITS),
         t_sigma=row(sensor.t_sigma, DIGITS),
         quaternion_xyzw=row(_quaternion(sensor.R_lidar_mag), DIGITS),
-        rotation_sigma=row(rotation_sigma, DIGITS),
+        rotation_sigma=row(sensor.turn_sigma_deg, DIGITS),
         scale=row(gains(sensor.distortion.C), DIGITS),
         H=row(H, DIGITS),
         H_sigma=row(sensor.H_sigma, DIGITS),

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
 from l2m_gtsam.records.by_sensor import BySensor
@@ -306,6 +307,18 @@ class SensorCalibration:
     def C_sigma(self) -> FloatArray:
         """Standard deviations of the entries of C, shape (3, 3)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:12]).reshape(3, 3))
+
+    @property
+    def turn_sigma_deg(self) -> FloatArray:
+        """Standard deviations of the rotation about the sensor's axes in degrees, shape (3,)."""
+        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.rotation_covariance))))
+
+    @property
+    def rotation_vector(self) -> FloatArray:
+        """``R_lidar_mag`` as a rotation vector, shape (3,); NaN where it is not known."""
+        if not np.isfinite(self.R_lidar_mag).all():
+            return np.full(3, np.nan)
+        return np.asarray(Rotation.from_matrix(self.R_lidar_mag).as_rotvec())
 
     @property
     def H_sigma(self) -> FloatArray:

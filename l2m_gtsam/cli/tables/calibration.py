@@ -59,7 +59,6 @@ def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
         return (name, status, *("-",) * 9, *counts, "-")
     distortion, R = sensor.distortion, sensor.R_lidar_mag.T
     angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
-    turned = np.degrees(np.sqrt(np.diag(sensor.rotation_covariance)))
     return (
         name,
         status,
@@ -67,8 +66,8 @@ def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
         sigmas_cell(1e3 * sensor.t_sigma),
         vector_cell(distortion.H, sensor.H_sigma, WIDTH),
         sigmas_cell(sensor.H_sigma),
-        vector_cell(np.array([angle]), turned.max(keepdims=True)),
-        sigmas_cell(turned),
+        vector_cell(np.array([angle]), sensor.turn_sigma_deg.max(keepdims=True)),
+        sigmas_cell(sensor.turn_sigma_deg),
         _clock(sensor.time_offset),
         f"{sensor.residuals.rms:.3f}",
         f"{sensor.residuals.readings:,}",

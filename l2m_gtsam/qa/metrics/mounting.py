@@ -2,7 +2,6 @@
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.metrics.plain import row
@@ -16,26 +15,18 @@ PAIRS = ((0, 1), (1, 2), (2, 0))
 def mounting(sensor: SensorCalibration) -> Mounting:
     """Return gains, skews, rotation and hard iron of a sensor that was solved."""
     C = sensor.distortion.C
-    turn = Rotation.from_matrix(sensor.R_lidar_mag).as_rotvec() if _turned(sensor) else _UNKNOWN
+    turn = sensor.rotation_vector
     angle = float(np.linalg.norm(turn))
     about = turn / angle if angle > 0 else np.zeros(3)
-    sigma = np.sqrt(np.diag(sensor.rotation_covariance).max())
     return Mounting(
         scale=row(gains(C)),
         skew_deg=row(skews_deg(C), 4),
         angle_deg=float(np.rad2deg(angle)),
         turned_about=row(about, 4),
-        angle_sigma_deg=float(np.rad2deg(sigma)),
+        angle_sigma_deg=float(sensor.turn_sigma_deg.max()),
         hard_iron=float(np.linalg.norm(sensor.distortion.H)),
         axes=axis_order(C),
     )
-
-
-_UNKNOWN = np.full(3, np.nan)
-
-
-def _turned(sensor: SensorCalibration) -> bool:
-    return bool(np.isfinite(sensor.R_lidar_mag).all())
 
 
 def gains(C: FloatArray) -> FloatArray:

@@ -68,11 +68,6 @@ class SensorSection:
         return roll_pitch_yaw(Rotation.from_matrix(R)) if np.isfinite(R).all() else None
 
     @property
-    def turn_sigma_deg(self) -> FloatArray:
-        """Standard deviations of the rotation about the sensor's axes in degrees, shape (3,)."""
-        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.sensor.rotation_covariance))))
-
-    @property
     def roll_pitch_yaw_sigma(self) -> FloatArray:
         """Standard deviations of these angles in degrees, shape (3,)."""
         turn = Rotation.from_matrix(self.sensor.R_lidar_mag)

@@ -359,13 +359,12 @@ def measured(
     options
         Thresholds.
     """
-    turned = np.rad2deg(np.sqrt(np.diag(sensor.rotation_covariance)))
     chi2 = np.nan if sensor.residuals is None else sensor.residuals.chi2_per_dof
     apart, passes = furthest_shown(found.halves, options)
     outside = _share(sensor.outside_map, sensor.inside + sensor.outside_map)
     every = (
         _in("sigma of t", "mm", _largest(sensor.t_sigma), options.position_sigma_m, 1e3),
-        _in("sigma of rotation", "°", _largest(turned), options.rotation_sigma_deg),
+        _in("sigma of rotation", "°", _largest(sensor.turn_sigma_deg), options.rotation_sigma_deg),
         replace(
             _in("sigma of H", "µT", _largest(sensor.H_sigma), options.hard_iron_sigma_ut),
             undetermined=Level.WARN,

@@ -228,8 +228,8 @@ def clock(case: Case) -> list[Reason]:
 def precision(case: Case) -> list[Reason]:
     """Return sigmas that are too large, and reasons to think that they are too small."""
     sensor, options = case.sensor, case.options
-    t, H = _largest(sensor.t_sigma), _largest(sensor.H_sigma)
-    angle = np.rad2deg(_largest(np.sqrt(np.diag(sensor.rotation_covariance))))
+    t, angle = _largest(sensor.t_sigma), _largest(sensor.turn_sigma_deg)
+    H = _largest(sensor.H_sigma)
     place = f"Its position is only known to ± {sigma_alone(1e3 * t)} mm (1 sigma)."
     offset = f"Its offset H is only known to ± {sigma_alone(H)} µT."
     rotation = f"Its rotation is only known to ± {sigma_alone(angle)}°."
