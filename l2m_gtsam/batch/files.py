@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -12,9 +12,9 @@ from l2m_gtsam.data import MapState, Recording, ScalarSeries, SourceFile
 from l2m_gtsam.errors import BagError, CalibrationError, MapError, OutputError
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap, Remembering, refuse_other_frame
-from l2m_gtsam.maps.tile_store import TileStore
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.options import Options, first_fault
-from l2m_gtsam.progress import Count, Progress, counter, reported
+from l2m_gtsam.progress import Progress, counter, reported
 from l2m_gtsam.records.map_diary import UNDATED, MapDrive
 from l2m_gtsam.records.provenance import MapOrigin, NamedSource
 from l2m_gtsam.records.verdict import Level
@@ -39,20 +39,11 @@ def check_outputs(*files: Path, suffix: str | None = None) -> None:
             raise OutputError(f"{file.parent}: is a file; a folder is needed there")
 
 
-@runtime_checkable
-class Tiled(Protocol):
-    """A map whose tiles are worth keeping."""
-
-    def with_store(self, store: TileStore) -> "FieldMap":
-        """Return the map that keeps its tiles in a store."""
-
-    def make_tiles(self, count: Count) -> int:
-        """Have all tiles in the store, and return how many there are."""
-
-
 def with_tiles(field_map: FieldMap, path: Path) -> FieldMap:
     """Return a map that keeps its tiles, if it has any, beside its file."""
-    return field_map.with_store(tiles_beside(path)) if isinstance(field_map, Tiled) else field_map
+    if not isinstance(field_map, HarmonicMap):
+        return field_map
+    return field_map.with_store(tiles_beside(path))
 
 
 def make_tiles(field_map: FieldMap, path: Path, progress: Progress) -> None:
@@ -64,7 +55,7 @@ def make_tiles(field_map: FieldMap, path: Path, progress: Progress) -> None:
         Called with a stage and the fraction of it that is done.
     """
     kept = with_tiles(field_map, path)
-    if isinstance(kept, Tiled):
+    if isinstance(kept, HarmonicMap):
         kept.make_tiles(counter("making tiles", progress))
 
 
