@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from l2m_gtsam.batch.files import check_outputs, saved_options
+from l2m_gtsam.batch.files import check_not_replaced, check_outputs, saved_options
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.data import CorrectedField, FloatArray, IntArray, ScalarSeries
-from l2m_gtsam.errors import BagError, CalibrationError, ConfigError, OutputError
+from l2m_gtsam.errors import BagError, CalibrationError, ConfigError
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.recording.regressors import ResampleOptions, resampled
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
@@ -136,7 +136,8 @@ def export_calibration(
         raise ConfigError(f"--format: unknown format {format_name!r}; accepted: {accepted}")
     if into is not None and format_name != "urdf":
         raise ConfigError("--into: goes with --format urdf alone")
-    _check_sources(out, calibration, into)
+    check_outputs(out)
+    check_not_replaced(out, calibration, into)
     chosen, result = FORMATS[format_name], read_sensors(calibration)
     judged = verdict_notes(calibration, result, despite_verdict)
     export = export_of(result, chosen.fault, names.lidar, names.sensors)
@@ -145,13 +146,6 @@ def export_calibration(
     with atomic_path(out) as temporary:
         temporary.write_bytes(content)
     return (*judged, *left_out_notes(export.left_out), *chosen.notes(export))
-
-
-def _check_sources(out: Path, *sources: Path | None) -> None:
-    """Raise an OutputError if a result would take the place of what it is made from."""
-    check_outputs(out)
-    if any(each is not None and out.exists() and out.samefile(each) for each in sources):
-        raise OutputError(f"{out}: would be overwritten, but is read; choose another --out")
 
 
 def _edited(export: Export, urdf: Path) -> bytes:

@@ -39,6 +39,12 @@ def check_outputs(*files: Path, suffix: str | None = None) -> None:
             raise OutputError(f"{file.parent}: is a file; a folder is needed there")
 
 
+def check_not_replaced(out: Path, *sources: Path | None) -> None:
+    """Raise an OutputError if a result would take the place of what it is made from."""
+    if any(each is not None and out.exists() and out.samefile(each) for each in sources):
+        raise OutputError(f"{out}: would be overwritten, but is read; choose another --out")
+
+
 def with_tiles(field_map: FieldMap, path: Path) -> FieldMap:
     """Return a map that keeps its tiles, if it has any, beside its file."""
     if not isinstance(field_map, HarmonicMap):

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.batch.files import SavedMap, map_notes
+from l2m_gtsam.batch.files import SavedMap, check_not_replaced, map_notes
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow
 from l2m_gtsam.batch.slam import (
@@ -19,7 +19,6 @@ from l2m_gtsam.batch.slam import (
     TRAJECTORY_FILE,
     SlamInput,
     calibration_notes,
-    check_not_replaced,
     map_provenance,
     opened,
     write_refined,
@@ -130,7 +129,7 @@ def slam_online(
     """
     saved = None if given.map is None else SavedMap.read(given.map)
     calibration = read_sensors(given.calibration)
-    check_not_replaced(given.calibration, out)
+    check_not_replaced(out / REFINED_FILE, given.calibration)
     truth = None if given.truth is None else read_tum(given.truth)
     recording = read_drive_or_follow(given.bag, config, progress)
     if len(recording.trajectory) < 2:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from l2m_gtsam.batch.drives import METRICS_FILE
-from l2m_gtsam.batch.files import SavedMap, check_outputs, map_notes
+from l2m_gtsam.batch.files import SavedMap, check_not_replaced, check_outputs, map_notes
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.reports import REPORT_FILE, SLAM_FILE, write_slam_report
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow, scan_start
@@ -203,7 +203,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     _check_folder(out)
     saved = None if given.map is None else SavedMap.read(given.map)
     calibration = read_sensors(given.calibration)
-    check_not_replaced(given.calibration, out)
+    check_not_replaced(out / REFINED_FILE, given.calibration)
     truth = None if given.truth is None else read_tum(given.truth)
     recording = read_drive_or_follow(given.bag, config, progress)
     scanned = read_evidence(given.bag, recording, saved, config, progress)
@@ -326,12 +326,6 @@ def _check_folder(out: Path) -> None:
         raise OutputError(
             f"{out}: holds a calibration, whose report would be lost; choose another --out"
         )
-
-
-def check_not_replaced(calibration: Path, out: Path) -> None:
-    """Raise an OutputError if the refined calibration would be written over what is read."""
-    if (out / REFINED_FILE).exists() and calibration.samefile(out / REFINED_FILE):
-        raise OutputError(f"{calibration}: would be overwritten, but is read; choose another --out")
 
 
 def write_refined(out: Path, calibration: CalibrationResult) -> None:
