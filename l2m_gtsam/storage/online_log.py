@@ -130,7 +130,7 @@ def logged_trajectory(lines: Sequence[LogLine]) -> Trajectory:
 
 
 KIND = "online-state"
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,9 @@ def assert_equal(a: object, b: object) -> None:
     assert type(a) is type(b)
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         np.testing.assert_array_equal(a, b)
-    elif isinstance(a, tuple) and isinstance(b, tuple):
+    elif isinstance(a, dict) and isinstance(b, dict):
+        assert_equal(tuple(a.items()), tuple(b.items()))
+    elif isinstance(a, tuple | list) and isinstance(b, tuple | list):
         assert len(a) == len(b)
         for x, y in zip(a, b, strict=True):
             assert_equal(x, y)

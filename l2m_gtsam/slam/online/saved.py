@@ -1,110 +1,274 @@
-"""States of localisations on line as arrays and plain values, and localisations that go on."""
+"""States of localisations on line as arrays, and localisations that go on."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import RigidTransform
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import ConfigError
-from l2m_gtsam.maps.harmonic.family import Hyperparameters
-from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.slam.drive import StartPose, as_pose
-from l2m_gtsam.slam.online.begun_with import (
-    is_same_calibration,
-    is_same_map,
-    packed_map,
-    packed_sensors,
-)
-from l2m_gtsam.slam.online.belief import POSE, Belief
+from l2m_gtsam.slam.drive import KnownSensors, StartPose
+from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose
+from l2m_gtsam.slam.online.begun_with import BegunWith
 from l2m_gtsam.slam.online.branches import Branch, BranchedFollower, GapDoubt
-from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
+from l2m_gtsam.slam.online.columns import packed, unpacked
+from l2m_gtsam.slam.online.events import OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower, LastBelief
-from l2m_gtsam.slam.online.intake import Intake, IntakeState
-from l2m_gtsam.slam.online.odometry_check import SuspectStep
-from l2m_gtsam.slam.online.odometry_pose import OdometryPose
-from l2m_gtsam.slam.online.packing import (
-    Arrays,
-    named,
-    packed_both_ways,
-    packed_drift,
-    packed_gaussian,
-    packed_key_poses,
-    packed_loops,
-    packed_one_field,
-    packed_poses,
-    resume_loops,
-    under,
-    unpacked_both_ways,
-    unpacked_drift,
-    unpacked_gaussian,
-    unpacked_key_poses,
-    unpacked_one_field,
-    unpacked_poses,
-)
-from l2m_gtsam.slam.online.scan_matching import LoopMatcher, ScanMatcher
-from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
+from l2m_gtsam.slam.online.intake import IntakeState
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+from l2m_gtsam.slam.online.scan_matching import KeptScan, LoopMatcher, ScanMatcher
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.online.start_search import StartSearchState
-from l2m_gtsam.slam.online.tracked_drift import TrackedDrift
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExplorerState, MarginalizedPose
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile
-from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
+from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer, OneFieldState
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile
 from l2m_gtsam.storage.online_log import SavedState
 
-FOLLOWING, EXPLORING, ONE_FIELD = "following", "exploring", "one_field"
-SEARCHING, WAITING = "searching", "waiting"
-SENSORS = ("t", "distortion", "covariance")
+NAME = "state"
 BEGIN = "begin without --resume"
 OTHER = f"the saved state is of another calibration, map or configuration: {BEGIN}"
 # What a file that was changed by hand may raise where arrays become objects.
 BROKEN = (KeyError, ValueError, IndexError, TypeError, RuntimeError, OverflowError)
 
 
+@dataclass(frozen=True)
+class KeptLoops:
+    """What a loop matcher remembers; attributes are its own."""
+
+    kept: tuple[KeptScan, ...]
+    path_m: float
+    last_m: float
+
+
+@dataclass(frozen=True)
+class KeptBranch:
+    """A branch of a drive in a map; attributes are those of its follower, and its own."""
+
+    last: LastBelief
+    log_likelihood: float
+    recorded: frozenset[int]
+
+    @classmethod
+    def of(cls, branch: Branch) -> "KeptBranch":
+        """Return a branch whose open section is closed."""
+        branch.follower.finish()
+        return cls(branch.follower.last, branch.follower.log_likelihood, branch.recorded)
+
+    def branch(self, slam: OnlineSlam) -> Branch:
+        """Return the branch that goes on."""
+        if self.last.belief.sensors.names != slam.sensors.names:
+            raise ValueError("a branch has other sensors than the calibration")
+        follower = Follower.resumed(self.last, slam.known_map(), slam.options)
+        follower.log_likelihood = self.log_likelihood
+        return Branch(follower, self.recorded)
+
+
+@dataclass(frozen=True)
+class KeptFollowing:
+    """A drive that is followed in a map; attributes are those of a ``BranchedFollower``."""
+
+    branches: tuple[KeptBranch, ...]
+    doubts: dict[int, GapDoubt]
+
+
+@dataclass(frozen=True)
+class KeptTile:
+    """A tile of an unknown field.
+
+    Attributes
+    ----------
+    anchor, past_information, returns
+        As of a ``RememberedTile``.
+    R_anchor_level
+        Axes of its box, shape (3, 3); the last points up.
+    heights
+        Along that, of the faces of the box, shape (2,), metres.
+    """
+
+    anchor: int
+    past_information: FloatArray
+    returns: int
+    R_anchor_level: FloatArray
+    heights: FloatArray
+
+    @classmethod
+    def of(cls, tile: RememberedTile) -> "KeptTile":
+        """Return what is to be kept of a tile; the rest follows from the prior."""
+        frame = tile.field.basis.frame
+        low = float(frame.R_map_tile[:, 2] @ frame.corner)
+        heights = np.array([low, low + frame.height])
+        return cls(tile.anchor, tile.past_information, tile.returns, frame.R_map_tile, heights)
+
+    def tile(self, number: int, prior: FieldPrior) -> RememberedTile:
+        """Return the tile."""
+        R = self.R_anchor_level
+        field = WaveTile.about(prior, R, self.heights[:, None] * R[:, 2])
+        return RememberedTile(number, self.anchor, field, self.past_information, self.returns)
+
+
+@dataclass(frozen=True)
+class KeptMemory:
+    """The memory of an unknown field.
+
+    Attributes
+    ----------
+    poses, vectors
+        Means of the variables of its joint Gaussian, by key.
+    sizes, covariance
+        As of the ``JointGaussian``.
+    tiles
+        By number.
+    """
+
+    poses: dict[int, gtsam.Pose3]
+    vectors: dict[int, FloatArray]
+    sizes: dict[int, int]
+    covariance: FloatArray
+    tiles: tuple[KeptTile, ...]
+
+    @classmethod
+    def of(cls, memory: FieldMemory) -> "KeptMemory":
+        """Return what is to be kept of a memory."""
+        known = memory.known
+        return cls(
+            {key: known.values.atPose3(key) for key in known.sizes if is_pose(key)},
+            {
+                key: known.values.atVector(key)[:size]
+                for key, size in known.sizes.items()
+                if not is_pose(key)
+            },
+            dict(known.sizes),
+            known.covariance,
+            tuple(KeptTile.of(each) for each in memory.tiles),
+        )
+
+    def memory(self, prior: FieldPrior) -> FieldMemory:
+        """Return the memory, of tiles of a prior."""
+        values = gtsam.Values()
+        for key, mean in (self.poses | self.vectors).items():
+            values.insert(key, mean)
+        known = JointGaussian(values, self.sizes, self.covariance)
+        return FieldMemory(known, tuple(own.tile(k, prior) for k, own in enumerate(self.tiles)))
+
+
+@dataclass(frozen=True)
+class KeptExploring:
+    """A drive in an unknown field.
+
+    Attributes
+    ----------
+    start
+        Of the ``Explorer``.
+    prior, past, waiting, last
+        As of an ``ExplorerState``.
+    memory
+        The same; None where the field is not learnt yet.
+    """
+
+    start: StartPose
+    prior: FieldPrior | None
+    memory: KeptMemory | None
+    past: tuple[MarginalizedPose, ...]
+    waiting: tuple[ArrivedKeyPose, ...]
+    last: int
+
+    @classmethod
+    def of(cls, explorer: Explorer) -> "KeptExploring":
+        """Return what is to be kept of an explorer, whose section is closed for it."""
+        state = explorer.state()
+        memory = None if state.prior is None else KeptMemory.of(state.memory)
+        return cls(explorer.start, state.prior, memory, state.past, state.waiting, state.last)
+
+    def explorer(self, slam: OnlineSlam) -> Explorer:
+        """Return the explorer that goes on."""
+        memory = FieldMemory.at_start(self.start)
+        if self.prior is not None and self.memory is not None:
+            memory = self.memory.memory(self.prior)
+        state = ExplorerState(self.prior, memory, self.past, self.waiting, self.last)
+        return Explorer.resumed(state, self.start, slam.sensors, slam.options)
+
+
+@dataclass(frozen=True)
+class KeptOneField:
+    """A drive of one sensor in an unknown field; attributes are its explorer's."""
+
+    start: StartPose
+    state: OneFieldState
+
+
+@dataclass(frozen=True)
+class KeptSlam:
+    """All that a localisation needs to go on.
+
+    Attributes
+    ----------
+    begun_with
+        Calibration and map: it does not go on with others.
+    intake, base, stamp_ns, search
+        As of an ``OnlineSlam``.
+    sensors
+        The same, where a drive whose place was lost has refined them.
+    refuted, left_out
+        Sensors that its ``CalibrationWatch`` has reported, and those whose readings do not count.
+    events
+        That nobody has read.
+    loops
+        What its ``LoopMatcher`` remembers, if it has one.
+    following, exploring, one_field
+        Its estimator; at most one is there.
+    """
+
+    begun_with: BegunWith
+    intake: IntakeState
+    sensors: KnownSensors | None
+    base: int
+    stamp_ns: int
+    refuted: frozenset[str]
+    left_out: frozenset[str]
+    events: tuple[OnlineEvent, ...]
+    loops: KeptLoops | None
+    search: StartSearchState | None
+    following: KeptFollowing | None
+    exploring: KeptExploring | None
+    one_field: KeptOneField | None
+
+
 def saved_state(slam: OnlineSlam) -> SavedState:
     """Return all that a localisation needs to go on; its open section is closed for it."""
-    arrays = {
-        **named("intake", _packed_intake(slam.intake.state)),
-        **named("given", _packed_given(slam)),
-        "sensor.names": np.frombuffer("\n".join(slam.sensors.names).encode(), dtype=np.uint8),
-        "base": np.array([slam.base, slam.stamp_ns], dtype=np.int64),
-    }
-    facts: dict[str, Any] = {"options": slam.options.model_dump(mode="json")}
-    facts["suspect"] = {
-        str(stamp): [each.kind.value, each.text]
-        for stamp, each in slam.intake.state.suspect.items()
-    }
-    facts["refuted"], facts["left_out"] = sorted(slam.watch.reported), sorted(slam.watch.out)
-    if isinstance(slam.matcher, LoopMatcher):
-        arrays |= named("loops", packed_loops(slam.matcher))
-    estimator, search = slam.estimator, slam.search
+    estimator, matcher, search = slam.estimator, slam.matcher, slam.search
+    following = exploring = one_field = loops = None
     if isinstance(estimator, BranchedFollower):
-        facts["stage"] = FOLLOWING
-        arrays |= named("belief", _packed_branches(estimator))
+        branches = tuple(KeptBranch.of(each) for each in estimator.branches)
+        following = KeptFollowing(branches, estimator.doubts)
     elif isinstance(estimator, Explorer):
-        facts["stage"] = EXPLORING
-        arrays |= named("explorer", _packed_explorer(estimator, facts))
+        exploring = KeptExploring.of(estimator)
     elif isinstance(estimator, OneFieldExplorer):
-        facts["stage"] = ONE_FIELD
-        arrays |= named("start", _packed_start(estimator.start))
-        arrays |= named("one_field", packed_one_field(estimator.state()))
-    elif search is not None:
-        facts["stage"] = SEARCHING
-        arrays |= named("waiting", packed_key_poses(search.waiting))
-        arrays |= named("first", _packed_start(search.first))
-        arrays["window_m"] = np.array([search.window_m])
-        own = {name: getattr(slam.sensors, name) for name in SENSORS}
-        arrays |= named("sensors", own)
-    else:
-        facts["stage"] = WAITING
-    unread = slam.unread_events()
-    facts["events"] = [[each.stamp_ns, each.kind.value, each.text] for each in unread]
-    return SavedState(arrays, facts)
+        one_field = KeptOneField(estimator.start, estimator.state())
+    if isinstance(matcher, LoopMatcher):
+        loops = KeptLoops(tuple(matcher.kept), matcher.path_m, matcher.last_m)
+    if search is not None:  # scans of all key poses would be gigabytes
+        search = replace(search, waiting=[replace(each, scans=()) for each in search.waiting])
+    kept = KeptSlam(
+        BegunWith.of(slam.given_sensors, slam.field_map),
+        slam.intake.state,
+        None if slam.sensors is slam.given_sensors else slam.sensors,
+        slam.base,
+        slam.stamp_ns,
+        frozenset(slam.watch.reported),
+        frozenset(slam.watch.out),
+        slam.unread_events(),
+        loops,
+        search,
+        following,
+        exploring,
+        one_field,
+    )
+    options = slam.options.model_dump(mode="json")
+    return SavedState(packed(KeptSlam, [kept], NAME), {"options": options})
 
 
 def resumed_slam(
@@ -129,260 +293,41 @@ def resumed_slam(
         The state is of another calibration, map or configuration, or it is damaged.
     """
     slam = OnlineSlam(calibration, options, field_map, matcher)
-    names = "\n".join(slam.sensors.names).encode()
     try:
-        if state.arrays["sensor.names"].tobytes() != names:
-            raise ConfigError(OTHER)
-        _refuse_other(slam, under("given", state.arrays))
-        # Options that a state of an older version does not name have their defaults.
+        (kept,) = unpacked(KeptSlam, state.arrays, 1, NAME)
+        _refuse_other(slam, kept.begun_with)
         if SlamOptions.model_validate(state.facts["options"]) != slam.options:
             raise ConfigError(OTHER)
-        _resume(slam, state)
-        unread = _unpacked_events(state.facts)
+        _resume(slam, kept)
     except BROKEN as error:
         raise ConfigError(f"the saved state is damaged: {BEGIN}") from error
-    slam.resume_report(unread)
     return slam
 
 
-def _packed_given(slam: OnlineSlam) -> Arrays:
-    arrays = packed_sensors(slam.given_sensors)
-    return arrays if slam.field_map is None else arrays | packed_map(slam.field_map)
-
-
-def _refuse_other(slam: OnlineSlam, given: Arrays) -> None:
-    """Refuse another calibration or map than a state was begun with; older states do not say."""
-    if not given:
-        return
-    if not is_same_calibration(given, slam.given_sensors):
+def _refuse_other(slam: OnlineSlam, begun_with: BegunWith) -> None:
+    """Refuse another calibration or map than a state was begun with."""
+    if not begun_with.is_calibration(slam.given_sensors):
         raise ConfigError(f"the saved state is of another calibration: give that one, or {BEGIN}")
-    if not is_same_map(given, slam.field_map):
+    if not begun_with.is_map(slam.field_map):
         raise ConfigError(f"the saved state is of another map: give that one, or {BEGIN}")
 
 
-def _unpacked_events(facts: dict[str, Any]) -> list[OnlineEvent]:
-    """Return the events of a state that nobody has read; older states have none."""
-    saved = facts.get("events", [])
-    return [OnlineEvent(int(at), EventKind(kind), str(text)) for at, kind, text in saved]
-
-
-def _resume(slam: OnlineSlam, state: SavedState) -> None:
-    arrays, facts = state.arrays, state.facts
-    slam.intake.resume(_unpacked_intake(under("intake", arrays), facts["suspect"], slam.intake))
-    slam.base, slam.stamp_ns = (int(each) for each in arrays["base"])
-    for names, key in ((slam.watch.reported, "refuted"), (slam.watch.out, "left_out")):
-        names.update(set(facts.get(key, ())) & set(slam.sensors.names))  # older states do not say
-    if isinstance(slam.matcher, LoopMatcher):
-        resume_loops(slam.matcher, under("loops", arrays))
-    stages: dict[str, Callable[[], None]] = {
-        FOLLOWING: lambda: _resume_following(slam, under("belief", arrays)),
-        EXPLORING: lambda: _resume_exploring(slam, under("explorer", arrays), facts),
-        ONE_FIELD: lambda: _resume_one_field(slam, arrays),
-        SEARCHING: lambda: _resume_searching(slam, arrays),
-        WAITING: lambda: None,
-    }
-    stages[facts["stage"]]()
-
-
-def _packed_start(start: StartPose) -> Arrays:
-    return {"R": start.T_map_lidar.R, "p": start.T_map_lidar.t, "covariance": start.covariance}
-
-
-def _unpacked_start(arrays: Arrays) -> StartPose:
-    return StartPose(RigidTransform(arrays["R"], arrays["p"]), arrays["covariance"])
-
-
-def _resume_searching(slam: OnlineSlam, arrays: Arrays) -> None:
-    waiting = unpacked_key_poses(under("waiting", arrays))
-    first = _unpacked_start(under("first", arrays))
-    t, distortion, covariance = (under("sensors", arrays)[name] for name in SENSORS)
-    slam.sensors = replace(slam.sensors, t=t, distortion=distortion, covariance=covariance)
-    slam.search = StartSearchState(first, waiting, float(arrays["window_m"][0]))
-
-
-def _packed_branches(branched: BranchedFollower) -> Arrays:
-    best, *others = branched.branches
-    at = [[number, each.stamp_ns] for number, each in branched.doubts.items()]
-    arrays = {
-        **_packed_branch(best),
-        "doubt.at": np.array(at, dtype=np.int64).reshape(-1, 2),
-        "doubt.covariance": np.reshape(
-            [each.covariance for each in branched.doubts.values()], (-1, POSE, POSE)
-        ),
-    }
-    for i, each in enumerate(others):
-        arrays |= named(f"other.{i}", _packed_branch(each))
-    return arrays
-
-
-def _packed_branch(branch: Branch) -> Arrays:
-    branch.follower.finish()
-    last = branch.follower.last
-    sensors = last.belief.sensors
-    return {
-        **packed_poses([last.belief.pose]),
-        "covariance": last.belief.covariance,
-        "t": sensors.t,
-        "distortion": sensors.distortion,
-        "number": np.array([last.number], dtype=np.int64),
-        "recorded": np.array(sorted(branch.recorded), dtype=np.int64),
-        "log_likelihood": np.array([branch.follower.log_likelihood]),
-        **named("drift", packed_drift(last.drift)),
-    }
-
-
-def _resume_following(slam: OnlineSlam, arrays: Arrays) -> None:
-    count = len({name.split(".")[1] for name in arrays if name.startswith("other.")})
-    others = [_unpacked_branch(slam, under(f"other.{i}", arrays)) for i in range(count)]
-    # Older states have no doubts.
-    doubts = {}
-    if "doubt.at" in arrays:
-        both = zip(arrays["doubt.at"].tolist(), arrays["doubt.covariance"], strict=True)
-        doubts = {number: GapDoubt(stamp, own) for (number, stamp), own in both}
-    slam.estimator = BranchedFollower(_unpacked_branch(slam, arrays), *others, doubts=doubts)
-
-
-def _unpacked_branch(slam: OnlineSlam, arrays: Arrays) -> Branch:
-    sensors = replace(slam.sensors, t=arrays["t"], distortion=arrays["distortion"])
-    belief = Belief(unpacked_poses(arrays)[0], sensors, arrays["covariance"])
-    over_m, own = slam.options.drift.over_m, under("drift", arrays)
-    # Older states have none: it is found again.
-    drift = unpacked_drift(own, over_m) if own else TrackedDrift.at_start(over_m, belief)
-    last = LastBelief(int(arrays["number"][0]), belief, drift)
-    follower = Follower.resumed(last, slam.known_map(), slam.options)
-    if "recorded" not in arrays:
-        return Branch(follower)
-    follower.log_likelihood = float(arrays["log_likelihood"][0])
-    return Branch(follower, frozenset(arrays["recorded"].tolist()))
-
-
-def _packed_explorer(explorer: Explorer, facts: dict[str, Any]) -> Arrays:
-    state = explorer.state()
-    arrays = named("start", _packed_start(explorer.start))
-    if state.prior is None:
-        return {**arrays, **packed_both_ways("waiting", state.waiting)}
-    facts["field"] = {
-        "hyperparameters": state.prior.hyperparameters.model_dump(mode="json"),
-        "resolution": [state.prior.resolution.floor, state.prior.resolution.ceiling],
-    }
-    arrays |= named("known", packed_gaussian(state.memory.known))
-    arrays |= named("past", packed_poses([each.T_anchor_key for each in state.past]))
-    arrays["past.anchor"] = np.array([each.anchor for each in state.past], dtype=np.int64)
-    arrays["last"] = np.array([state.last], dtype=np.int64)
-    for tile in state.memory.tiles:
-        frame = tile.field.basis.frame
-        low = float(frame.R_map_tile[:, 2] @ frame.corner)
-        arrays |= named(
-            f"tile.{tile.number}",
-            {
-                "anchor": np.array([tile.anchor], dtype=np.int64),
-                "R": frame.R_map_tile,
-                "heights": np.array([low, low + frame.height]),
-                "past_information": tile.past_information,
-                "returns": np.array([tile.returns], dtype=np.int64),
-            },
-        )
-    return arrays
-
-
-def _resume_exploring(slam: OnlineSlam, arrays: Arrays, facts: dict[str, Any]) -> None:
-    start = _unpacked_start(under("start", arrays))
-    if "field" not in facts:
-        waiting = tuple(unpacked_both_ways("waiting", arrays))
-        state = ExplorerState(None, FieldMemory.at_start(start), (), waiting, 0)
-    else:
-        state = _unpacked_memory(slam, arrays, facts["field"])
-    slam.estimator = Explorer.resumed(state, start, slam.sensors, slam.options)
-
-
-def _resume_one_field(slam: OnlineSlam, arrays: Arrays) -> None:
-    start = _unpacked_start(under("start", arrays))
-    state = unpacked_one_field(under("one_field", arrays))
-    slam.estimator = OneFieldExplorer.resumed(state, start, slam.sensors, slam.options)
-
-
-def _unpacked_memory(slam: OnlineSlam, arrays: Arrays, field: dict[str, Any]) -> ExplorerState:
-    floor, ceiling = (float(each) for each in field["resolution"])
-    hyperparameters = Hyperparameters.model_validate(field["hyperparameters"])
-    prior = FieldPrior(hyperparameters, Resolution(floor, ceiling), slam.options.tiles)
-    count = len({name.split(".")[1] for name in arrays if name.startswith("tile.")})
-    tiles = tuple(_unpacked_tile(k, under(f"tile.{k}", arrays), prior) for k in range(count))
-    past = under("past", arrays)
-    poses = zip(past["anchor"].tolist(), unpacked_poses(past), strict=True)
-    memory = FieldMemory(unpacked_gaussian(under("known", arrays)), tiles)
-    kept = tuple(MarginalizedPose(anchor, pose) for anchor, pose in poses)
-    return ExplorerState(prior, memory, kept, (), int(arrays["last"][0]))
-
-
-def _unpacked_tile(number: int, arrays: Arrays, prior: FieldPrior) -> RememberedTile:
-    R = arrays["R"]
-    field = WaveTile.about(prior, R, arrays["heights"][:, None] * R[:, 2])
-    returns = int(arrays["returns"][0]) if "returns" in arrays else 0  # of older states
-    anchor, past = int(arrays["anchor"][0]), arrays["past_information"]
-    return RememberedTile(number, anchor, field, past, returns)
-
-
-def _packed_intake(state: IntakeState) -> Arrays:
-    poses, unknown = state.poses, np.full((6, 6), np.nan)
-    arrays: Arrays = {
-        **packed_poses([as_pose(each.T) for each in poses]),
-        "stamp_ns": np.array([each.stamp_ns for each in poses], dtype=np.int64),
-        "covariance": np.reshape(
-            [unknown if each.covariance is None else each.covariance for each in poses], (-1, 6, 6)
-        ),
-        "number": np.array([state.number, state.disordered], dtype=np.int64),
-        "velocity": np.stack([state.velocity, state.last_velocity]),
-        "first_R": state.first_R,
-    }
-    for stamp, each in state.suspect.items():
-        own = {"R": each.end.R, "p": each.end.t, "covariance": each.covariance}
-        own["flags"] = np.array([each.lost, each.doubtful], dtype=np.int64)
-        arrays |= named(f"suspect.{stamp}", own)
-    for i, buffer in enumerate(state.sensors):
-        flags = [buffer.last_ns, buffer.same, buffer.silent, buffer.stuck, buffer.disordered]
-        own = {
-            "stamp_ns": np.array(buffer.stamp_ns, dtype=np.int64),
-            "values": np.reshape(buffer.values, (-1, 3)),
-            "last": buffer.last,
-            "flags": np.array(flags, dtype=np.int64),
-        }
-        arrays |= named(f"sensor.{i}", own)
-    return arrays
-
-
-def _unpacked_intake(arrays: Arrays, texts: dict[str, Any], intake: Intake) -> IntakeState:
-    poses = [
-        OdometryPose(int(stamp), RigidTransform(R, p), P if np.isfinite(P).all() else None)
-        for stamp, R, p, P in zip(
-            arrays["stamp_ns"], arrays["R"], arrays["p"], arrays["covariance"], strict=True
-        )
-    ]
-    suspect = {}
-    for stamp, (kind, text) in texts.items():
-        own = under(f"suspect.{stamp}", arrays)
-        end = RigidTransform(own["R"], own["p"])
-        flags = (bool(each) for each in own["flags"])
-        suspect[int(stamp)] = SuspectStep(
-            EventKind(kind), str(text), end, own["covariance"], *flags
-        )
-    sensors = []
-    for i in range(len(intake.state.sensors)):
-        own = under(f"sensor.{i}", arrays)
-        last_ns, same, silent, stuck, disordered = own["flags"].tolist()
-        sensors.append(
-            SensorBuffer(
-                own["stamp_ns"].tolist(),
-                list(own["values"]),
-                last_ns,
-                own["last"],
-                same,
-                bool(silent),
-                bool(stuck),
-                bool(disordered),
-            )
-        )
-    number, disordered = arrays["number"].tolist()
-    usual, last = arrays["velocity"]
-    return IntakeState(
-        poses, sensors, number, suspect, usual, last, bool(disordered), arrays["first_R"]
-    )
+def _resume(slam: OnlineSlam, kept: KeptSlam) -> None:
+    names = frozenset(slam.sensors.names)
+    if len(kept.intake.sensors) != len(names) or not kept.refuted | kept.left_out <= names:
+        raise ValueError("the state has other sensors than the calibration")
+    slam.intake.resume(kept.intake)
+    slam.sensors = kept.sensors or slam.given_sensors
+    slam.search, slam.base, slam.stamp_ns = kept.search, kept.base, kept.stamp_ns
+    slam.watch.reported, slam.watch.out = set(kept.refuted), set(kept.left_out)
+    if isinstance(slam.matcher, LoopMatcher) and kept.loops is not None:
+        slam.matcher.resume(kept.loops.kept, kept.loops.path_m, kept.loops.last_m)
+    if kept.following is not None:
+        branches = [each.branch(slam) for each in kept.following.branches]
+        slam.estimator = BranchedFollower(*branches, doubts=kept.following.doubts)
+    elif kept.exploring is not None:
+        slam.estimator = kept.exploring.explorer(slam)
+    elif kept.one_field is not None:
+        start, state = kept.one_field.start, kept.one_field.state
+        slam.estimator = OneFieldExplorer.resumed(state, start, slam.sensors, slam.options)
+    slam.resume_report(kept.events)

@@ -1,6 +1,5 @@
 """One sensor in an unknown field, on line: a recorded model ship, drifted as published."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from l2m_gtsam.slam.unknown_field import one_field_explorer
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import Hypotheses
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 from l2m_gtsam.slam.unknown_field.smoothed_drive import smoothed
-from l2m_gtsam.storage.online_log import SavedState
 from l2m_gtsam.studies.slam.methods import as_recorded, online_row, rms, stated_drift
 from l2m_gtsam.studies.slam.recordings import (
     ROBOT,
@@ -101,24 +99,11 @@ def test_it_is_one_field_and_jumps_of_the_recording_are_motion(
     assert rms(np.stack([each.T_map_lidar.t for each in poses]), truth) < 0.7 * rms(drift, truth)
 
 
-def of_old(slam: OnlineSlam) -> SavedState:
-    """Return the state as it was saved before odometry's steady turning was known."""
-    state = saved_state(slam)
-    arrays = {k: v for k, v in state.arrays.items() if not k.endswith("turning")}
-    assert len(arrays) < len(state.arrays)
-    (steady,) = (k for k in arrays if k.endswith("beginning.steady"))
-    covariance = steady.replace("steady", "covariance")
-    arrays |= {steady: arrays[steady][:6], covariance: arrays[covariance][:-2, :-2]}
-    options = {**state.facts["options"], "drift": dict(state.facts["options"]["drift"])}
-    options["drift"].pop("steady_turn_deg_per_m")
-    return SavedState(arrays, state.facts | {"options": options})
-
-
 # Of the messages. The field is learnt after 22 % of them.
 @pytest.mark.parametrize(
-    ("share", "until", "learnt", "stored"),
-    [(0.12, 0.25, False, saved_state), (0.3, 0.4, True, saved_state), (0.3, 0.35, True, of_old)],
-    ids=["before the field is learnt", "after", "by a version that knew no turning"],
+    ("share", "until", "learnt"),
+    [(0.12, 0.25, False), (0.3, 0.4, True)],
+    ids=["before the field is learnt", "after"],
 )
 def test_a_saved_drive_goes_on_as_it_would_have(
     ship: TrueDrive,
@@ -126,7 +111,6 @@ def test_a_saved_drive_goes_on_as_it_would_have(
     share: float,
     until: float,
     learnt: bool,
-    stored: Callable[[OnlineSlam], SavedState],
 ) -> None:
     odometry, options = odometry_of(ship, Form.VEHICLE)
     given = list(messages(ship.recording(odometry)))
@@ -134,7 +118,7 @@ def test_a_saved_drive_goes_on_as_it_would_have(
     slam = OnlineSlam(as_recorded(STATED_UT), options)
     first = [pose for each in given[:at] for pose in give(slam, each)]
     assert (EventKind.FIELD_LEARNT in [each.kind for each in slam.events()]) is learnt
-    slam = resumed_slam(stored(slam), as_recorded(STATED_UT), options)
+    slam = resumed_slam(saved_state(slam), as_recorded(STATED_UT), options)
     rest = [pose for each in given[at:end] for pose in give(slam, each)]
     expected = whole[1][: len(first) + len(rest)]
     assert [each.stamp_ns for each in (*first, *rest)] == [each.stamp_ns for each in expected]

@@ -16,7 +16,6 @@ from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.localisation import known_sensors
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
-from l2m_gtsam.slam.online.packing import packed_drift, unpacked_drift
 from l2m_gtsam.slam.online.tracked_drift import TrackedDrift
 from tests.drives.slam import calibrated, rounds
 from tests.worlds.exact import random_sensors
@@ -146,18 +145,6 @@ def test_after_a_motion_that_odometry_lost_the_drift_is_still_known() -> None:
     on = anew.moved(way.key_poses[-1], away).seen(away)
     sigma = np.sqrt(np.diag(found.known.covariance))
     assert (np.abs(on.known.drift - found.known.drift) < 2 * sigma).all()
-
-
-def test_a_drift_is_saved() -> None:
-    way = way_of(7)
-    found = tracked(way, list(told(way, 7)))
-    again = unpacked_drift(packed_drift(found), OVER_M)
-    for mine, other in zip(
-        (*vars(found.known).values(), *vars(found.before).values(), *vars(found.way).values()),
-        (*vars(again.known).values(), *vars(again.before).values(), *vars(again.way).values()),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(mine, other)
 
 
 def test_a_steady_turning_is_a_walk_of_the_heading() -> None:
