@@ -4,15 +4,14 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
-import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.calibrate import VERSIONED
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, SourceFile, Trajectory
-from l2m_gtsam.geometry import moved, to_ros
+from l2m_gtsam.data import FloatArray, IntArray, Readings, SourceFile, Trajectory
+from l2m_gtsam.geometry import to_ros
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
@@ -34,10 +33,12 @@ from l2m_gtsam.records.localisation_file import (
 from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.record import fields_of
 from l2m_gtsam.records.validation import ChiSquare
-from l2m_gtsam.slam.drift import DRIFT
 from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.marginals import Marginals, pose_covariances
 from l2m_gtsam.slam.moved_sensors import calibration_change
+from l2m_gtsam.slam.pose_graph import drive_values, odometry_graph
 from l2m_gtsam.slam.solution import DriveSolution
+from l2m_gtsam.slam.solver import colamd_ordering
 from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.solve.noise import map_covariance
 from l2m_gtsam.solve.rank import PARAMETERS
@@ -181,38 +182,10 @@ def _odometry(drive: Drive, at: Trajectory) -> tuple[OdometryRecord, ...]:
 def odometry_covariance(drive: Drive) -> FloatArray:
     """Return the covariance of each key pose by odometry alone, shape (K, 6, 6).
 
-    Of right perturbations, rotation (rad) before translation (m): the start's, propagated, with
-    each step's and those of a wrong scale and of a steady drift.
+    Of right perturbations, rotation (rad) before translation (m).
     """
-    covariance, steps = [drive.start.covariance], drive.steps
-    for R, p, more in zip(steps.R, steps.p, steps.covariance, strict=True):
-        covariance.append(moved(covariance[-1][None], RigidTransform(R, p))[0] + more)
-    poses = drive.dead_reckoning()
-    by_scale = steps.scale * _moved_by_scale(poses)
-    by_drift = _moved_by_drift(drive, poses)
-    return (
-        np.stack(covariance)
-        + by_scale[:, :, None] * by_scale[:, None]
-        + by_drift @ by_drift.transpose(0, 2, 1)
-    )
-
-
-def _moved_by_drift(drive: Drive, poses: list[gtsam.Pose3]) -> FloatArray:
-    """Return right perturbations of K poses by units of a steady drift, shape (K, 6, 8)."""
-    moved_by, drifts = np.zeros((len(poses), 6, DRIFT)), drive.drifts
-    if drifts is not None:
-        for k, own in enumerate(drifts):
-            before, after = poses[k : k + 2]
-            carried = after.between(before).AdjointMap() @ moved_by[k]
-            moved_by[k + 1] = carried + np.kron(np.eye(2), after.rotation().matrix().T) @ own
-    return moved_by
-
-
-def _moved_by_scale(poses: list[gtsam.Pose3]) -> FloatArray:
-    """Return right perturbations of K poses by a relative error of all lengths, shape (K, 6)."""
-    p0 = poses[0].translation()
-    shift = [each.rotation().matrix().T @ (each.translation() - p0) for each in poses]
-    return np.hstack([np.zeros((len(poses), 3)), np.stack(shift)])
+    graph, values = odometry_graph(drive), drive_values(drive, drive.dead_reckoning())
+    return pose_covariances(Marginals(graph.linearize(values), colamd_ordering(graph)), len(drive))
 
 
 def _refined(before: CalibrationResult, result: LocalisationResult) -> tuple[RefinedSensor, ...]:

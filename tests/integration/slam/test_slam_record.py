@@ -15,6 +15,7 @@ from l2m_gtsam.qa.metrics.evidence import sensor_evidence as asked_again
 from l2m_gtsam.qa.metrics.trajectory import localised_trajectory
 from l2m_gtsam.records.localisation import OdometryScale, OdometryTurn
 from l2m_gtsam.records.localisation_file import LocalisationRecord
+from l2m_gtsam.slam.drive import stacked
 from l2m_gtsam.slam.map_prediction import poses_in
 from l2m_gtsam.slam.pose_graph import drive_values, odometry_graph
 from l2m_gtsam.slam.record import odometry_covariance, sensor_evidence
@@ -43,6 +44,20 @@ def test_odometry_with_shared_errors_is_as_sure_as_its_graph(
     for k in range(len(drive)):
         expected = marginals.marginalCovariance(X(k))
         np.testing.assert_allclose(found[k], expected, rtol=1e-6, atol=1e-9 * expected.max())
+
+
+def test_steps_along_fixed_axes_do_not_turn_with_the_vehicle() -> None:
+    """Errors of positions are those of the steps: a wrong heading moves none of them."""
+    drive = localised().solution.drive
+    _, p = stacked(drive.dead_reckoning())
+    along = np.diff(p, axis=0) @ drive.start.T_map_lidar.R
+    steps = replace(drive.steps, steady=None, fixed_axes=along)
+    drive = replace(drive, steps=steps)
+    found = odometry_covariance(drive)
+    of_steps = np.trace(steps.covariance[:, 3:, 3:], axis1=1, axis2=2)
+    start = np.trace(drive.start.covariance[3:, 3:])
+    expected = start + np.append(0.0, np.cumsum(of_steps))
+    np.testing.assert_allclose(np.trace(found[:, 3:, 3:], axis1=1, axis2=2), expected, rtol=1e-6)
 
 
 def test_odometry_is_as_sure_as_its_graph() -> None:
