@@ -11,13 +11,17 @@ import numpy as np
 
 from l2m_factors import D, G, T, V, X
 from l2m_gtsam.calibration.joint_information import columns_at, slices_of
-from l2m_gtsam.calibration.optimise import refused
+from l2m_gtsam.calibration.optimise import Ending, refused
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.localisation import OdometryScale, OdometryTurn
 from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.map_prediction import poses_in
 from l2m_gtsam.slam.online.belief import POSE
+from l2m_gtsam.slam.pose_graph import link_squared, odometry_graph, steady_drift
+from l2m_gtsam.slam.relative_motion import DrivePrediction
 from l2m_gtsam.slam.selected_inverse import inverse_of, shared_covariances
+from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.solve.linear_algebra import triangular_information_root
 
 Result = TypeVar("Result")
@@ -280,6 +284,50 @@ def drive_covariances(
         np.stack(found[:K]),
         np.reshape(found[K : K + J], (-1, 2 * POSE, 2 * POSE)),
         np.stack(found[K + J :]) if free else sensors.covariance,
+    )
+
+
+def solved_drive(
+    drive: Drive,
+    values: gtsam.Values,
+    marginals: Marginals,
+    predicted: DrivePrediction,
+    weights: FloatArray,
+    ending: Ending,
+) -> DriveSolution:
+    """Return a drive as its graph solves it, without changes of the map.
+
+    Parameters
+    ----------
+    drive
+        K key poses with N readings, of sensors as they are estimated.
+    values, marginals
+        Of the graph's variables.
+    predicted
+        Its readings at these.
+    weights
+        Their robust weights, shape (N,).
+    ending
+        Why the optimisation stopped.
+    """
+    covariances = drive_covariances(marginals, drive, drive.sensors, values)
+    return DriveSolution(
+        drive=drive,
+        poses=poses_in(values, len(drive)),
+        pose_covariance=covariances.poses,
+        calibration_covariance=covariances.sensors,
+        prediction=predicted.prediction,
+        interpolation_covariance=predicted.interpolation_covariance,
+        squared=predicted.squared(drive.sensors.noise),
+        weights=weights,
+        near_changes=np.zeros(len(weights), dtype=np.bool_),
+        odometry_chi2=2 * odometry_graph(drive).error(values) / (POSE * len(drive)),
+        link_squared=link_squared(drive.links, values),
+        ending=ending,
+        step_covariance=covariances.steps,
+        scale=odometry_scale(marginals, values),
+        turn=odometry_turn(marginals, values, drive),
+        steady=steady_drift(values),
     )
 
 

@@ -34,11 +34,11 @@ from l2m_gtsam.records.provenance import NamedSource
 from l2m_gtsam.records.record import fields_of
 from l2m_gtsam.records.validation import ChiSquare
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.marginals import Marginals, pose_covariances
+from l2m_gtsam.slam.marginals import pose_covariances
 from l2m_gtsam.slam.moved_sensors import calibration_change
 from l2m_gtsam.slam.pose_graph import drive_values, odometry_graph
 from l2m_gtsam.slam.solution import DriveSolution
-from l2m_gtsam.slam.solver import colamd_ordering
+from l2m_gtsam.slam.solver import marginals_of
 from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.solve.noise import map_covariance
 from l2m_gtsam.solve.rank import PARAMETERS
@@ -185,7 +185,7 @@ def odometry_covariance(drive: Drive) -> FloatArray:
     Of right perturbations, rotation (rad) before translation (m).
     """
     graph, values = odometry_graph(drive), drive_values(drive, drive.dead_reckoning())
-    return pose_covariances(Marginals(graph.linearize(values), colamd_ordering(graph)), len(drive))
+    return pose_covariances(marginals_of(graph, values), len(drive))
 
 
 def _refined(before: CalibrationResult, result: LocalisationResult) -> tuple[RefinedSensor, ...]:

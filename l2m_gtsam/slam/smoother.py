@@ -19,16 +19,14 @@ from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, ReadingFits, changed
 from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.map_errors import SharedMapErrors, errors_of
 from l2m_gtsam.slam.map_prediction import place_readings, poses_in, predict, sensors_in
-from l2m_gtsam.slam.marginals import Marginals, drive_covariances, odometry_scale, odometry_turn
+from l2m_gtsam.slam.marginals import Marginals, solved_drive
 from l2m_gtsam.slam.online.follower import Follower, follow
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
     calibration_graph,
     link_graph,
-    link_squared,
     odometry_graph,
     shared_values,
-    steady_drift,
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
@@ -175,25 +173,14 @@ class SmoothingProblem:
         optimised = gauss_newton(graph, values, order, self._options.max_iterations)
         values, sensors = optimised.values, self.sensors(optimised.values)
         marginals = Marginals(graph.linearize(values), order)
-        covariances = drive_covariances(marginals, self._drive, sensors, values)
         predicted = self.predict(values)
-        return DriveSolution(
-            drive=replace(self._drive, sensors=sensors),
-            poses=poses_in(values, len(self._drive)),
-            pose_covariance=covariances.poses,
-            calibration_covariance=covariances.sensors,
-            prediction=predicted.prediction,
-            interpolation_covariance=predicted.interpolation_covariance,
-            squared=predicted.squared(sensors.noise),
-            weights=weights * predicted.prediction.inside,
-            near_changes=np.zeros(len(weights), dtype=np.bool_),
-            odometry_chi2=2 * self._odometry.error(values) / (6 * len(self._drive)),
-            scale=odometry_scale(marginals, values),
-            turn=odometry_turn(marginals, values, self._drive),
-            steady=steady_drift(values),
-            link_squared=link_squared(self._drive.links, values),
-            ending=optimised.ending if ending is Ending.TOLERANCE else ending,
-            step_covariance=covariances.steps,
+        return solved_drive(
+            replace(self._drive, sensors=sensors),
+            values,
+            marginals,
+            predicted,
+            weights * predicted.prediction.inside,
+            optimised.ending if ending is Ending.TOLERANCE else ending,
         )
 
 

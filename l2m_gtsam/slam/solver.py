@@ -30,7 +30,7 @@ from l2m_gtsam.calibration.optimise import (
     Optimised,
     most_after_step,
 )
-from l2m_gtsam.slam.marginals import unless_indeterminate
+from l2m_gtsam.slam.marginals import Marginals, unless_indeterminate
 
 LAST = (ord("T"), ord("D"), ord("V"))
 # Of the first step, and the least: it changes steps, not the minimum. From 1e-10, where GTSAM comes
@@ -153,6 +153,11 @@ def _solver(
 def colamd_ordering(graph: gtsam.NonlinearFactorGraph) -> gtsam.Ordering:
     """Return the minimum-degree ordering."""
     return gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+
+
+def marginals_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Marginals:
+    """Return the covariances of a graph at its solution."""
+    return Marginals(graph.linearize(values), colamd_ordering(graph))
 
 
 def weights_first(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Ordering:

@@ -30,18 +30,16 @@ from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import BoolArray
 from l2m_gtsam.records.localisation import Gain
 from l2m_gtsam.slam.drive import Drive, KnownSensors
-from l2m_gtsam.slam.marginals import Marginals, PoseCovariance, drive_covariances
+from l2m_gtsam.slam.marginals import PoseCovariance, solved_drive
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
     calibration_graph,
     calibration_values,
     drive_graph,
     drive_values,
-    link_squared,
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
-from l2m_gtsam.slam.solution import DriveSolution
-from l2m_gtsam.slam.solver import colamd_ordering
+from l2m_gtsam.slam.solver import marginals_of
 from l2m_gtsam.slam.unknown_field.linear_field import AXES
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from l2m_gtsam.slam.unknown_field.tiled_smoother import AWAY_M, FieldSolution, in_map
@@ -165,7 +163,7 @@ def narrowing(mapped: FieldSolution, options: SlamOptions) -> float:
     if options.calibration is CalibrationUse.REFINED:
         priors.push_back(calibration_graph(drive.sensors))
         values.insert(calibration_values(drive.sensors))
-    before = Marginals(priors.linearize(values), colamd_ordering(priors)).log_determinant()
+    before = marginals_of(priors, values).log_determinant()
     return mapped.of_graph.log_determinant([M(tile.number) for tile in tiles]) - before
 
 
@@ -184,28 +182,22 @@ def along_odometry(
         As of ``with_gain``.
     """
     graph, values = drive_graph(drive), drive_values(drive, poses)
-    marginals = Marginals(graph.linearize(values), colamd_ordering(graph))
+    marginals = marginals_of(graph, values)
     sensors, robust = drive.sensors, options.robust
-    covariances = drive_covariances(marginals, drive, sensors, values)
     motions = RelativeMotions.along(drive, poses)
     tiled = TiledDrive.lasting(motions, poses, sensors, prior)
     weights = tiled.weights(sensors, sensors.noise)
     predicted = DrivePrediction(motions, tiled.prediction(weights, sensors))
-    squared = predicted.squared(sensors.noise)
-    solution = DriveSolution(
-        drive=drive,
-        poses=poses,
-        pose_covariance=covariances.poses,
-        calibration_covariance=sensors.covariance,
+    trust = np.asarray(
+        WEIGHTS[robust.loss](predicted.squared(sensors.noise), robust.largest, np.inf)
+    )
+    solution = replace(
+        solved_drive(drive, values, marginals, predicted, trust, Ending.TOLERANCE),
         prediction=in_map(predicted, tiled, poses, sensors),
-        interpolation_covariance=predicted.interpolation_covariance,
-        squared=squared,
-        weights=np.asarray(WEIGHTS[robust.loss](squared, robust.largest, np.inf)),
-        near_changes=np.zeros(len(squared), dtype=np.bool_),
-        odometry_chi2=0.0,
-        link_squared=link_squared(drive.links, values),
-        ending=Ending.TOLERANCE,
-        step_covariance=covariances.steps,
+        odometry_chi2=0.0,  # no correction is made
+        scale=None,
+        turn=None,
+        steady=None,
     )
     returns = tiled.anchoring.returns(drive.steps.path, AWAY_M)
     return FieldSolution(solution, tiled, returns, marginals, marginals)

@@ -14,12 +14,12 @@ from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose, part_of, prior_factors, retracted
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings, sensors_in
-from l2m_gtsam.slam.marginals import Marginals, joint_posterior
+from l2m_gtsam.slam.marginals import joint_posterior
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import between_factor, link_graph
-from l2m_gtsam.slam.solver import colamd_ordering, stepwise_levenberg_marquardt
+from l2m_gtsam.slam.solver import colamd_ordering, marginals_of, stepwise_levenberg_marquardt
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile, tile_of
 from l2m_gtsam.slam.unknown_field.section_readings import SectionReadings, TileReadings
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile
@@ -97,7 +97,7 @@ class OpenSection:
         graph = self._factors(self._counted)
         prior = self._memory.known.marginal(self._shared)
         graph.push_back(prior_factors(prior))
-        left = Marginals(graph.linearize(self._values), colamd_ordering(graph)).log_determinant()
+        left = marginals_of(graph, self._values).log_determinant()
         known = np.linalg.slogdet(prior.covariance)[1]
         known += sum(np.linalg.slogdet(each.covariance)[1] for each in self.key_poses)
         largest = self._options.robust.largest

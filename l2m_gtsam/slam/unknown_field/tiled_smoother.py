@@ -18,9 +18,7 @@ from l2m_gtsam.slam.map_prediction import MapPrediction, place_readings, poses_i
 from l2m_gtsam.slam.marginals import (
     Marginals,
     PoseCovariance,
-    drive_covariances,
-    odometry_scale,
-    odometry_turn,
+    solved_drive,
 )
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
@@ -28,9 +26,7 @@ from l2m_gtsam.slam.pose_graph import (
     calibration_values,
     drive_values,
     link_graph,
-    link_squared,
     odometry_graph,
-    steady_drift,
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
@@ -190,28 +186,14 @@ class TiledProblem:
         drive, sensors = self._drive, solved.sensors
         order = self._ordering(solved.graph, solved.values)
         marginals = Marginals(solved.graph.linearize(solved.values), order)
-        covariances = drive_covariances(marginals, drive, sensors, solved.values)
         motions = RelativeMotions.along(drive, solved.poses)
         tiled = solved.tiled.moved(motions, solved.poses, sensors)
         predicted = DrivePrediction(motions, tiled.prediction(solved.values, sensors))
-        solution = DriveSolution(
-            drive=replace(drive, sensors=sensors),
-            poses=solved.poses,
-            pose_covariance=covariances.poses,
-            calibration_covariance=covariances.sensors,
-            prediction=in_map(predicted, tiled, solved.poses, sensors),
-            interpolation_covariance=predicted.interpolation_covariance,
-            squared=predicted.squared(sensors.noise),
-            weights=solved.weights,
-            near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
-            odometry_chi2=2 * self._odometry.error(solved.values) / (6 * len(drive)),
-            scale=odometry_scale(marginals, solved.values),
-            turn=odometry_turn(marginals, solved.values, drive),
-            steady=steady_drift(solved.values),
-            link_squared=link_squared(drive.links, solved.values),
-            ending=solved.ending,
-            step_covariance=covariances.steps,
+        own = replace(drive, sensors=sensors)
+        found = solved_drive(
+            own, solved.values, marginals, predicted, solved.weights, solved.ending
         )
+        solution = replace(found, prediction=in_map(predicted, tiled, solved.poses, sensors))
         path = drive.steps.path
         returns = tiled.anchoring.returns(path, AWAY_M)
         return FieldSolution(solution, tiled, returns, marginals, marginals)

@@ -16,11 +16,11 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress, completed
 from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.map_prediction import PlacedReadings, poses_in
-from l2m_gtsam.slam.marginals import Marginals, pose_covariances
+from l2m_gtsam.slam.marginals import pose_covariances
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import drive_graph, drive_values
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
-from l2m_gtsam.slam.solver import colamd_ordering
+from l2m_gtsam.slam.solver import marginals_of
 from l2m_gtsam.slam.unknown_field.gain import gain_of
 from l2m_gtsam.slam.unknown_field.path_information import PathNeighbourhood, path_information
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
@@ -222,7 +222,7 @@ def at_odometry(drive: Drive, prior: WholePrior, options: SlamOptions) -> FieldS
     stage = solved_stage(problem, drive.dead_reckoning(), sensors, last.rounds)
     found = problem.finished(stage.last)
     graph, values = drive_graph(drive), drive_values(drive, drive.dead_reckoning())
-    marginals = Marginals(graph.linearize(values), colamd_ordering(graph))
+    marginals = marginals_of(graph, values)
     solution = replace(
         found.solution,
         drive=replace(drive, sensors=found.solution.drive.sensors),
