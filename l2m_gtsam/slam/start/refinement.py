@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_factors import skew
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, RowTable, joined_rows
 from l2m_gtsam.slam.start.screening import StartHypotheses, about_z
 from l2m_gtsam.slam.start.window import Pattern
 
@@ -23,7 +23,7 @@ UNKNOWNS = 6
 
 
 @dataclass(frozen=True)
-class PatternPoses:
+class PatternPoses(RowTable):
     """S poses of a pattern in a map, with their costs.
 
     Attributes
@@ -41,9 +41,6 @@ class PatternPoses:
     def __len__(self) -> int:
         return len(self.p)
 
-    def __getitem__(self, rows: IntArray) -> "PatternPoses":
-        return PatternPoses(self.R[rows], self.p[rows], self.cost[rows])
-
     @classmethod
     def upright(cls, places: StartHypotheses) -> "PatternPoses":
         """Return hypotheses as poses."""
@@ -55,17 +52,9 @@ class PatternPoses:
         turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
         return replace(self, R=turn @ self.R, p=self.p + step[:, 3:])
 
-    def where(self, better: BoolArray, other: "PatternPoses") -> "PatternPoses":
-        """Return those of ``other`` where it is better, shape (S,)."""
-        return PatternPoses(
-            np.where(better[:, None, None], other.R, self.R),
-            np.where(better[:, None], other.p, self.p),
-            np.where(better, other.cost, self.cost),
-        )
-
 
 @dataclass(frozen=True)
-class Slopes:
+class Slopes(RowTable):
     """Derivatives of costs by turns about the map's axes (rad) and shifts (m).
 
     ``gradient`` has the shape (S, 6), ``curvature``, of Gauss and Newton, (S, 6, 6).
@@ -73,13 +62,6 @@ class Slopes:
 
     gradient: FloatArray
     curvature: FloatArray
-
-    def where(self, better: BoolArray, other: "Slopes") -> "Slopes":
-        """Return those of ``other`` where it is better, shape (S,)."""
-        return Slopes(
-            np.where(better[:, None], other.gradient, self.gradient),
-            np.where(better[:, None, None], other.curvature, self.curvature),
-        )
 
     def damped_step(self, damping: FloatArray, longest: FloatArray) -> FloatArray:
         """Return Levenberg-Marquardt steps, none longer than ``longest`` (6,), shape (S, 6)."""
@@ -116,7 +98,8 @@ def refined_poses(
         step = slopes.damped_step(damping, longest)
         tried, there = linearised_cost(poses.moved(step), pattern, field_map)
         better = tried.cost < poses.cost
-        poses, slopes = poses.where(better, tried), slopes.where(better, there)
+        rows = np.arange(len(poses)) + len(poses) * better  # those tried come after the others
+        poses, slopes = joined_rows([poses, tried])[rows], joined_rows([slopes, there])[rows]
         damping = np.maximum(np.where(better, LESS, MORE) * damping, LEAST)
         if (np.abs(step) < SETTLED * longest).all():
             break

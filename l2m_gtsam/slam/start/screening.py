@@ -21,7 +21,7 @@ from numba import njit
 from scipy.ndimage import distance_transform_edt
 
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray, joined_rows
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RowTable, joined_rows
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.parallel.threads import in_threads
@@ -281,7 +281,7 @@ def row_of(rows: IntArray, at: IntArray, node: IntArray) -> int:
 
 
 @dataclass(frozen=True)
-class StartHypotheses:
+class StartHypotheses(RowTable):
     """N hypotheses of a pattern's pose in a map.
 
     Attributes
@@ -300,9 +300,6 @@ class StartHypotheses:
 
     def __len__(self) -> int:
         return len(self.yaw)
-
-    def __getitem__(self, rows: IntArray) -> "StartHypotheses":
-        return StartHypotheses(self.p[rows], self.yaw[rows], self.score[rows])
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky, eigh, solve_triangular
 
 from l2m_factors import skew
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray, RowTable
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1)  # of a change, over the prior of the waves
@@ -29,7 +29,7 @@ MOTION = np.repeat([np.deg2rad(5.0), 0.3], 3)  # what is known of xi at least, r
 
 
 @dataclass(frozen=True)
-class Seen:
+class Seen(RowTable):
     """Readings of a tile in the frame of its anchor.
 
     Attributes
@@ -49,9 +49,6 @@ class Seen:
 
     def __len__(self) -> int:
         return len(self.points)
-
-    def __getitem__(self, rows: IntArray | BoolArray) -> "Seen":
-        return Seen(self.points[rows], self.field[rows], self.variance[rows], self.key_pose[rows])
 
     def thinned(self, most: int) -> "Seen":
         """Return so many of them at most, evenly spread."""
