@@ -30,6 +30,7 @@ from l2m_gtsam.calibration.optimise import (
     Optimised,
     most_after_step,
 )
+from l2m_gtsam.progress import completed
 from l2m_gtsam.slam.marginals import Marginals, unless_indeterminate
 
 LAST = (ord("T"), ord("D"), ord("V"))
@@ -96,14 +97,7 @@ def levenberg_marquardt(
     close
         Decrease of the error below which it has converged.
     """
-    first = _optimizer(graph, start, ordering, max_iterations, close, LinearSolver.CHOLESKY)
-    before, values = first.lambda_(), first.optimize()
-    left = max_iterations - first.iterations()
-    if first.lambda_() > before and left > 0:
-        second = _optimizer(graph, values, ordering, left, close, _solver(graph, values, ordering))
-        values = second.optimize()
-        left -= second.iterations()
-    return Optimised(values, Ending.TOLERANCE if left > 0 else Ending.ITERATION_LIMIT)
+    return completed(stepwise_levenberg_marquardt(graph, start, ordering, max_iterations, close))
 
 
 def stepwise_levenberg_marquardt(
@@ -112,21 +106,20 @@ def stepwise_levenberg_marquardt(
     ordering: gtsam.Ordering,
     max_iterations: int,
     close: float = TOLERANCE,
-) -> Generator[None, None, gtsam.Values]:
+) -> Generator[None, None, Optimised]:
     """Minimise a graph's error by Levenberg-Marquardt, one iteration after the other.
 
-    Yields before each iteration, and returns the values. Parameters as of ``levenberg_marquardt``,
-    whose result it has.
+    Yields before each iteration. Parameters and result are those of ``levenberg_marquardt``.
     """
     first = _optimizer(graph, start, ordering, max_iterations, close, LinearSolver.CHOLESKY)
     before = first.lambda_()
     yield from _iterations(first, max_iterations, close)
     values, left = first.values(), max_iterations - first.iterations()
-    if first.lambda_() > before and left > 0:  # as there
+    if first.lambda_() > before and left > 0:
         second = _optimizer(graph, values, ordering, left, close, _solver(graph, values, ordering))
         yield from _iterations(second, left, close)
-        values = second.values()
-    return values
+        values, left = second.values(), left - second.iterations()
+    return Optimised(values, Ending.TOLERANCE if left > 0 else Ending.ITERATION_LIMIT)
 
 
 def _iterations(

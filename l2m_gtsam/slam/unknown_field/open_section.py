@@ -213,7 +213,7 @@ class OpenSection:
         values, most = part_of(self._values, poses), self._options.max_iterations
         order = colamd_ordering(graph)
         found = yield from stepwise_levenberg_marquardt(graph, values, order, most, CLOSE)
-        self._values.update(found)
+        self._values.update(found.values)
         yield
 
     def _places(self) -> FloatArray:
@@ -349,9 +349,8 @@ class OpenSection:
     def _solved(self, graph: gtsam.NonlinearFactorGraph, most: int) -> Generator[None, None, None]:
         """Solve for all variables of the section, with a limit of steps."""
         order = colamd_ordering(graph)
-        self._values = yield from stepwise_levenberg_marquardt(
-            graph, self._values, order, most, CLOSE
-        )
+        found = yield from stepwise_levenberg_marquardt(graph, self._values, order, most, CLOSE)
+        self._values = found.values
         self._sensors = sensors_in(self._values, self._sensors)
         yield
 

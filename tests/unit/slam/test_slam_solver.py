@@ -9,6 +9,7 @@ import pytest
 from l2m_gtsam.calibration.optimise import TOLERANCE, Ending
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.solver import (
+    DAMPING,
     colamd_ordering,
     gauss_newton,
     levenberg_marquardt,
@@ -107,18 +108,26 @@ def in_steps(
     graph: gtsam.NonlinearFactorGraph, begin: gtsam.Values, most: int, close: float = TOLERANCE
 ) -> tuple[gtsam.Values, int]:
     """Return values that are solved for step by step, and how often the work was interrupted."""
-    return completed(
+    found, pauses = completed(
         stepwise_levenberg_marquardt(graph, begin, colamd_ordering(graph), most, close)
     )
+    return found.values, pauses
 
 
 @pytest.mark.parametrize("most", [1, 3, 50])
-def test_step_by_step_it_is_the_same_descent(most: int) -> None:
+def test_step_by_step_it_is_the_descent_of_gtsams_own_loop(most: int) -> None:
     graph, values, _ = chain([0.1] * 6, [0.02] * 6)
     rng, begin = np.random.default_rng(4), gtsam.Values()
     for key in values.keys():  # noqa: SIM118 - GTSAM's values cannot be iterated
         begin.insert(key, values.atPose3(key).retract(0.3 * rng.normal(size=6)))
     found, pauses = in_steps(graph, begin, most)
-    at_once = levenberg_marquardt(graph, begin, colamd_ordering(graph), most).values
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(most)
+    params.setAbsoluteErrorTol(TOLERANCE)
+    params.setRelativeErrorTol(TOLERANCE)
+    params.setlambdaInitial(DAMPING)
+    params.setlambdaLowerBound(DAMPING)
+    params.setOrdering(colamd_ordering(graph))
+    at_once = gtsam.LevenbergMarquardtOptimizer(graph, begin, params).optimize()
     assert found.equals(at_once, 1e-12)
     assert pauses == most or (most == 50 and 3 <= pauses < 20)
