@@ -73,15 +73,7 @@ class Marginals:
 
     def of(self, key: int) -> FloatArray:
         """Return the covariance of one variable."""
-        tree = self._cholesky
-        covariance = (
-            None if tree is None else unless_indeterminate(lambda: tree.marginalCovariance(key))
-        )
-        if covariance is None:
-            covariance = covariance_of(
-                self._qr.marginalFactor(key, gtsam.EliminateQR).jacobian()[0]
-            )
-        return covariance
+        return self.joint([key])
 
     def joint(self, keys: Sequence[int]) -> FloatArray:
         """Return the joint covariance of some variables, in this order."""
