@@ -35,7 +35,7 @@ from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatu
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.scans import PoseFix, ScanEvidence
 from l2m_gtsam.records.verdict import Level, Verdict
-from l2m_gtsam.slam.exploration import explore
+from l2m_gtsam.slam.exploration import explore, field_samples
 from l2m_gtsam.slam.localisation import NO_SCANS, localise, start_pose
 from l2m_gtsam.slam.odometry import scan_odometry
 from l2m_gtsam.slam.options import Usage
@@ -315,7 +315,7 @@ def _explored(
 ) -> _Found:
     found = explore(recording, calibration, config.slam, progress, evidence)
     with reported("building the map", progress):
-        field_map = build_map(found.points, found.field, config.mapping.model)
+        field_map = build_map(*field_samples(found.solution), config.mapping.model)
     return _Found(recording, found.result, found.solution, field_map)
 
 

@@ -14,7 +14,7 @@ from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import EXACT_START, Drive, KnownSensors
 from l2m_gtsam.slam.held_calibration import held_notes, with_calibration_use
-from l2m_gtsam.slam.localisation import NO_SCANS, prepared
+from l2m_gtsam.slam.localisation import NO_SCANS, Localisation, prepared
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
@@ -38,27 +38,6 @@ NO_FIELD = (
 MISSTATED = 2.0
 
 
-@dataclass(frozen=True)
-class Exploration:
-    """A drive through a place without a map.
-
-    Attributes
-    ----------
-    result
-        Poses, verdict and figures; the calibration's file is to be filled in.
-    solution
-        Solution of the graph.
-    points, field
-        Positions in metres and field in uT of the N readings that count, in the frame of the poses,
-        shapes (N, 3).
-    """
-
-    result: LocalisationResult
-    solution: DriveSolution
-    points: FloatArray
-    field: FloatArray
-
-
 @one_blas_thread()
 def explore(
     recording: Recording,
@@ -66,7 +45,7 @@ def explore(
     options: SlamOptions,
     progress: Progress,
     evidence: ScanEvidence = NO_SCANS,
-) -> Exploration:
+) -> Localisation:
     """Estimate the poses of a drive and the field along it, from where its odometry begins.
 
     Parameters
@@ -139,8 +118,7 @@ def explore(
         explored=explored,
         gain=mapped.gain,
     )
-    points, field = field_samples(mapped.solution.drive, mapped.solution)
-    return Exploration(result, mapped.solution, points, field)
+    return Localisation(result, mapped.solution)
 
 
 @dataclass(frozen=True)
@@ -231,8 +209,8 @@ def explored_result(result: LocalisationResult, explored: Explored) -> Localisat
     return replace(result, status=LocalisationStatus.NOT_CONVERGED, message=NO_FIELD)
 
 
-def field_samples(drive: Drive, solution: DriveSolution) -> tuple[FloatArray, FloatArray]:
+def field_samples(solution: DriveSolution) -> tuple[FloatArray, FloatArray]:
     """Return positions in metres and field in uT of the readings that count, shapes (N, 3)."""
     rows = np.flatnonzero(solution.used)
     where = solution.prediction.placed
-    return where.x[rows], where.field(drive.sensors)[rows]
+    return where.x[rows], where.field(solution.drive.sensors)[rows]

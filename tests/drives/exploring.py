@@ -9,8 +9,8 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.drive import EXACT_START, Drive, as_poses
-from l2m_gtsam.slam.exploration import Exploration, explore
-from l2m_gtsam.slam.localisation import prepared
+from l2m_gtsam.slam.exploration import explore
+from l2m_gtsam.slam.localisation import Localisation, prepared
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.slam.options import SlamOptions
@@ -79,6 +79,6 @@ def prepared_drive(
     return replace(drive, start=replace(drive.start, covariance=EXACT_START)), true
 
 
-def explored(drive: SlamDrive, sensors: tuple[KnownSensor, ...], **options: object) -> Exploration:
+def explored(drive: SlamDrive, sensors: tuple[KnownSensor, ...], **options: object) -> Localisation:
     chosen = SlamOptions.model_validate({"key_poses": COARSE, **options})
     return explore(drive.recording, calibrated(sensors), chosen, silent)
