@@ -15,7 +15,7 @@ from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import EXACT_START, Drive, KnownSensors
 from l2m_gtsam.slam.held_calibration import held_notes, with_calibration_use
 from l2m_gtsam.slam.localisation import NO_SCANS, Localisation, prepared
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.options import NEEDS_MAP, CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.slips import judged, with_open_jumps, with_recorded_jumps
@@ -74,7 +74,7 @@ def explore(
         The start is to be searched for, without a map.
     """
     if options.start.anywhere:
-        raise ConfigError("`slam.start.anywhere` searches a map for the start: give one with --map")
+        raise ConfigError(NEEDS_MAP)
     drive, notes = prepared(recording, calibration, options, evidence)
     if not options.start.is_given:
         drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))

@@ -52,6 +52,7 @@ class StartSearchOptions(Options):
     the recorded drives true places leave 0.2 to 1.7, a false one 2.2."""
 
 
+NEEDS_MAP = "`slam.start.anywhere` searches a map for the start: give one with --map"
 MOST_WAVES = 1000  # of a tile: what takes a matrix of 8 MB
 
 
@@ -322,7 +323,7 @@ def refuse_offline_only(options: SlamOptions, *, has_map: bool, one_field: bool)
     if has_map:
         return
     if options.start.anywhere:
-        raise ConfigError("`slam.start.anywhere` searches a map for the start: give one with --map")
+        raise ConfigError(NEEDS_MAP)
     if options.calibration is CalibrationUse.REFINED and one_field:
         raise ConfigError(
             "`slam.calibration: refined` of one sensor without a map works off line only; on line "

@@ -17,7 +17,7 @@ from l2m_gtsam.slam.joint_gaussian import JointGaussian, of_key_pose
 from l2m_gtsam.slam.map_prediction import sensors_in
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.pose_graph import EXACT
-from l2m_gtsam.slam.unknown_field.tiles import WaveTile, level_axes, tile_about
+from l2m_gtsam.slam.unknown_field.tiles import WaveTile, horizontal_distance, level_axes
 
 CALIBRATION = (ord("T"), ord("D"))
 
@@ -94,8 +94,13 @@ class FieldMemory:
 
 
 def tile_of(pose: gtsam.Pose3, anchors: list[gtsam.Pose3], core: float) -> int:
-    """Return the number of the tile that contains a pose; the next number if none does."""
+    """Return the number of the nearest tile; the next number where its core has not the pose.
+
+    ``core`` is the side of that, metres.
+    """
     if not anchors:
         return 0
     R, places = stacked(anchors)
-    return tile_about(pose.translation(), level_axes(R), places, core)
+    distance = horizontal_distance(pose.translation() - places, level_axes(R))
+    nearest = int(distance.argmin())
+    return nearest if distance[nearest] <= core / 2 else len(anchors)

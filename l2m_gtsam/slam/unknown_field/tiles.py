@@ -268,23 +268,6 @@ def anchor_tiles(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
     return Anchoring(np.array(anchors), tile)
 
 
-def tile_about(p: FloatArray, axes: FloatArray, anchors: FloatArray, core: float) -> int:
-    """Return the number of the nearest of B tiles; B where a place is in the core of none.
-
-    Parameters
-    ----------
-    p
-        The place in the map in metres, shape (3,).
-    axes, anchors
-        Of the tiles: level axes, shape (B, 3, 3), and where they are fixed, shape (B, 3), metres.
-    core
-        Of a tile in metres.
-    """
-    distance = horizontal_distance(p - anchors, axes)
-    nearest = int(distance.argmin())
-    return nearest if distance[nearest] <= core / 2 else len(anchors)
-
-
 def horizontal_distance(away: FloatArray, axes: FloatArray) -> FloatArray:
     """Return the larger of both horizontal components of vectors, shape (N,).
 

@@ -10,8 +10,10 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
+from l2m_gtsam.slam.drive import as_poses
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import MOST_WAVES, SlamOptions, TileOptions
+from l2m_gtsam.slam.unknown_field.field_memory import tile_of
 from l2m_gtsam.slam.unknown_field.tiles import (
     Anchoring,
     FieldPrior,
@@ -20,8 +22,6 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     drive_prior,
     field_prior,
     larger,
-    level_axes,
-    tile_about,
 )
 from tests.drives.exploring import COARSE
 from tests.drives.moved_steel import moved_steel
@@ -72,9 +72,9 @@ def test_tiles_of_a_whole_path_are_those_that_key_pose_after_key_pose_has(
     seed: int, core: float
 ) -> None:
     R, p = walk(seed)
-    axes, anchors, tiles = level_axes(R), list[int](), list[int]()
-    for k, place in enumerate(p):
-        number = tile_about(place, axes[anchors], p[anchors], core) if anchors else 0
+    poses, anchors, tiles = as_poses(R, p), list[int](), list[int]()
+    for k, pose in enumerate(poses):
+        number = tile_of(pose, [poses[anchor] for anchor in anchors], core)
         anchors += [k] if number == len(anchors) else []
         tiles.append(number)
     laid = anchor_tiles(R, p, core)
