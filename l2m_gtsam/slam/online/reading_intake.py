@@ -41,9 +41,8 @@ class ReadingIntake:
     def __init__(self, names: tuple[str, ...], unusable: Mapping[str, str]) -> None:
         self._names, self._unusable = names, unusable
         self.buffers = [SensorBuffer() for _ in names]
-        self._strangers = set[str]()
-        self._implausible = set[str]()  # sensors that were reported to read no field
-        self._ahead = set[str]()  # sensors that were reported to be ahead of odometry
+        # Sensors that were reported: of no calibration, to read no field, to be ahead of odometry.
+        self._strangers, self._implausible, self._ahead = set[str](), set[str](), set[str]()
         self._events: list[OnlineEvent] = []
 
     def events(self) -> list[OnlineEvent]:
@@ -79,7 +78,9 @@ class ReadingIntake:
         """
         require_stamp(stamp_ns)
         if sensor not in self._names:
-            self._meet_stranger(stamp_ns, sensor)
+            if len(self._strangers) < MOST_STRANGERS:
+                text = left_out(sensor, self._unusable.get(sensor) or why_unusable(None))
+                self._report_once(self._strangers, sensor, stamp_ns, EventKind.UNUSABLE, text)
             return
         own = np.array(value, dtype=np.float64)
         if own.shape != (3,):
@@ -88,10 +89,15 @@ class ReadingIntake:
             return
         strength = float(np.linalg.norm(own))
         if not READ_UT[0] <= strength <= READ_UT[1]:
-            self._refuse_strength(stamp_ns, sensor, strength)
+            text = (
+                f"{sensor} reads {strength:.4g} where microtesla are wanted: is it in another "
+                "unit? Such readings are left out"
+            )
+            self._report_once(self._implausible, sensor, stamp_ns, EventKind.UNUSABLE, text)
             return
         if ahead := seconds_ahead(stamp_ns, last_ns):
-            self._refuse_ahead(stamp_ns, sensor, ahead)
+            text = f"a reading of {sensor} is stamped {ahead:.1f} s ahead of odometry: left out"
+            self._report_once(self._ahead, sensor, stamp_ns, EventKind.OUT_OF_ORDER, text)
             return
         self._ahead.discard(sensor)
         buffer = self.buffers[self._names.index(sensor)]
@@ -126,26 +132,12 @@ class ReadingIntake:
             for kind in buffer.check(stamp_ns, silent_ns, moved=moved):
                 self._report_sensor(stamp_ns, name, kind)
 
-    def _meet_stranger(self, stamp_ns: int, sensor: str) -> None:
-        if sensor not in self._strangers and len(self._strangers) < MOST_STRANGERS:
-            self._strangers.add(sensor)
-            text = left_out(sensor, self._unusable.get(sensor) or why_unusable(None))
-            self._report(stamp_ns, EventKind.UNUSABLE, text)
-
-    def _refuse_strength(self, stamp_ns: int, sensor: str, strength: float) -> None:
-        if sensor not in self._implausible:
-            self._implausible.add(sensor)
-            text = (
-                f"{sensor} reads {strength:.4g} where microtesla are wanted: is it in another "
-                "unit? Such readings are left out"
-            )
-            self._report(stamp_ns, EventKind.UNUSABLE, text)
-
-    def _refuse_ahead(self, stamp_ns: int, sensor: str, ahead_s: float) -> None:
-        if sensor not in self._ahead:
-            self._ahead.add(sensor)
-            text = f"a reading of {sensor} is stamped {ahead_s:.1f} s ahead of odometry: left out"
-            self._report(stamp_ns, EventKind.OUT_OF_ORDER, text)
+    def _report_once(
+        self, reported: set[str], sensor: str, stamp_ns: int, kind: EventKind, text: str
+    ) -> None:
+        if sensor not in reported:
+            reported.add(sensor)
+            self._report(stamp_ns, kind, text)
 
     def _report_sensor(self, stamp_ns: int, sensor: str, kind: EventKind) -> None:
         self._report(stamp_ns, kind, f"{sensor} {TEXTS[kind]}")
