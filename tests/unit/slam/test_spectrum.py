@@ -100,8 +100,12 @@ def test_a_search_ends_at_a_maximum() -> None:
     readings = read(SensorNoise(1.5, 0.1, 3.0), np.diag([1.3, 0.8, 1.0]), 0)
     found = learnt_spectrum(readings, 0.3, 10.0, WAVES)
     likelihood = SpectrumLikelihood(readings, 0.3, 10.0, WAVES)
+
+    def cost(at: FloatArray) -> float:
+        return -likelihood.log_likelihood(at)
+
     more = minimize(
-        lambda at: -likelihood.log_likelihood(at),
+        cost,
         found.at,
         method="Nelder-Mead",
         bounds=Bounds(LOWEST, HIGHEST),
