@@ -149,14 +149,20 @@ def noise_notes(found: SensorNoise | None, sensors: KnownSensors) -> NoiseNotes:
             f"calibration states {stated:.2g} uT"
         )
         return NoiseNotes(warnings=(own,))
-    both = (
-        f"at its start readings are off by {found.ut:.2g} uT each, by the drive itself; their "
-        f"calibrations state {stated:.2g} uT"
-    )
     if found.ut > MISSTATED * stated:
-        return NoiseNotes((f"{both}: the noise is stated too small, or calibrations are off",))
+        small = (
+            f"at its start readings are off by {found.ut:.2g} uT each, by the drive itself; their "
+            f"calibrations state {stated:.2g} uT: the noise is stated too small, or calibrations "
+            "are off"
+        )
+        return NoiseNotes(warnings=(small,))
     if stated > MISSTATED * found.ut:
-        return NoiseNotes(hints=(f"{both}: with less noise stated poses would be known better",))
+        large = (
+            f"at its start readings are off by {found.ut:.2g} uT each, by the drive itself; their "
+            f"calibrations state {stated:.2g} uT: with less noise stated poses would be known "
+            "better"
+        )
+        return NoiseNotes(hints=(large,))
     return NoiseNotes()
 
 

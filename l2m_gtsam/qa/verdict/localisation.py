@@ -226,8 +226,9 @@ def _truth(truth: TruthRecord, options: SlamQaOptions) -> list[Reason]:
         text = f"Against the truth, localising made the error of the position larger: {errors}."
         first = warning(text)
     else:
-        text = f"Against the truth, {truth.removed:.0%} of odometry's error is gone: {errors}."
-        first = note(text)
+        removed = truth.removed  # not a number where odometry is the truth itself
+        gone = "" if np.isnan(removed) else f"{removed:.0%} of odometry's error is gone: "
+        first = note(f"Against the truth, {gone}{errors}.")
     text = (
         f"Against the truth, errors of the poses are {truth.nees_ratio**0.5:.1f} times their "
         f"standard deviations (NEES {truth.nees:.1f}; consistent: expected {POSE_FREEDOM})."

@@ -139,6 +139,11 @@ def test_the_truth_counts() -> None:
     worse = replace(truth, odometry=truth.localised, localised=truth.odometry)
     (text,) = texts(judged(replace(good(), truth=worse)), Level.WARN)
     assert "made the error of the position larger" in text
+    exact = replace(truth.odometry, rms_m=0.0)
+    same = judged(replace(good(), truth=replace(truth, odometry=exact, localised=exact)))
+    assert any(
+        "Against the truth, 0 mm rms of odometry" in each for each in texts(same, Level.PASS)
+    )
     lies = judged(replace(good(), truth=replace(truth, nees=70.0)))
     assert lies.level is Level.FAIL
 
