@@ -35,7 +35,7 @@ FIRST = np.array([0.0, 0.0, -2.0, -2.0, 0.7])
 LOWEST = np.array([-3.0, -1.2, -6.0, -7.0, -3.0])
 HIGHEST = np.array([3.0, 3.0, 1.0, 7.0, 4.0])
 LENGTH = 1  # which of them that is
-SHORTEST_M = float(np.exp(LOWEST[LENGTH]))
+SHORTEST_M, LONGEST_M = (float(np.exp(each[LENGTH])) for each in (LOWEST, HIGHEST))
 
 
 @dataclass(frozen=True)

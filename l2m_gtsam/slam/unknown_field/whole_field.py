@@ -19,6 +19,7 @@ from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 from l2m_gtsam.slam.unknown_field.spectrum import (
     LEARNT_FROM,
+    LONGEST_M,
     MARGIN,
     SHORTEST_M,
     FieldSpectrum,
@@ -29,9 +30,9 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile, TiledDrive
 from l2m_gtsam.slam.unknown_field.tiles import Anchoring, relative_place
 
 LEAST_WAVES = 50
-# In the logarithm of the likelihood. Searches end up to seven below the maximum.
+# In the logarithm of the likelihood, of which five parameters are learnt: more is no chance.
 CLEAR = 10.0
-LONGER = np.geomspace(1.05, 20.0, 60)  # times a length, of which the first that is held is taken
+LONGER = 1.05  # lengths are tried that are so many times the one before
 
 
 @dataclass(frozen=True)
@@ -154,6 +155,8 @@ def learnt_prior(
         return prior
     # A search may end at a field of short waves that nothing speaks for.
     least = shortest_held(drive, poses, options.waves, spectrum)
+    if least is None:
+        return None
     longer = spectrum_at(drive, poses, options, COARSE, first, least)
     if longer.log_likelihood < spectrum.log_likelihood - CLEAR:
         return None
@@ -162,18 +165,21 @@ def learnt_prior(
 
 def shortest_held(
     drive: Drive, poses: list[gtsam.Pose3], waves: int, spectrum: FieldSpectrum
-) -> float:
+) -> float | None:
     """Return the shortest length in metres of a coarse field that so many eigenfunctions hold.
 
-    Other parameters as of ``learnt_prior``; ``spectrum`` is of a field of shorter length.
+    Other parameters as of ``learnt_prior``; ``spectrum`` is of a field of shorter length. None
+    where the longest that is learnt is too short for the box, too.
     """
-    length = spectrum.prior.length
 
-    def held(times: float) -> bool:
-        prior = spectrum.prior.model_copy(update={"length": times * length})
+    def held(length: float) -> bool:
+        prior = spectrum.prior.model_copy(update={"length": length})
         return full_prior(drive, poses, replace(spectrum, prior=prior), COARSE).waves <= waves
 
-    return float(length * next(times for times in LONGER if held(times)))
+    length = LONGER * spectrum.prior.length
+    while length < LONGEST_M and not held(length):
+        length *= LONGER
+    return length if length < LONGEST_M else None
 
 
 def fine_prior(

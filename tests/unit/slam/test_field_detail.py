@@ -84,8 +84,20 @@ def test_the_shortest_length_that_is_held_is_the_shortest(
     def needed(length: float) -> int:
         return full_prior(drive, poses, with_length(short, length), COARSE).waves
 
+    assert least is not None
     assert least > short.prior.length
     assert needed(least) <= waves < needed(0.94 * least)  # lengths are tried in steps of 5 %
+
+
+def test_a_box_that_no_length_fits_has_no_prior(
+    drive: Drive, short: FieldSpectrum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As along hundreds of metres: the drive is one for tiles then."""
+    monkeypatch.setattr(whole_field, "spectrum_at", lambda *_: short)
+    monkeypatch.setattr(whole_field, "waves_for", lambda *_: 81)
+    poses, options = drive.dead_reckoning(), WholeFieldOptions(waves=80)
+    assert shortest_held(drive, poses, options.waves, short) is None
+    assert learnt_prior(drive, poses, options) is None
 
 
 @pytest.mark.parametrize("less", [-3.0, 0.5 * CLEAR, 2 * CLEAR])
