@@ -226,8 +226,8 @@ class Gain(Record):
     Attributes
     ----------
     likelier
-        Logarithm of how much likelier the readings are at the corrected poses, less what these
-        cost against odometry; with tiles over all poses, about the corrected ones.
+        Logarithm of how much likelier the corrected poses are than odometry's: by the readings,
+        less what these poses cost against odometry and by how much readings narrow them.
     moved_m
         Root mean square distance of the corrected positions from odometry's, metres.
     doubt
@@ -246,9 +246,9 @@ class Gain(Record):
         """The figures as a clause."""
         change = "likelier" if self.likelier > 0 else "less likely"
         return (
-            f"poses that the readings correct by {self.moved_m:.2g} m rms make the readings "
-            f"{change} by exp({abs(self.likelier):.0f}), and are further from the truth than "
-            f"odometry with a probability of {self.doubt:.2g}"
+            f"poses that the readings correct by {self.moved_m:.2g} m rms are {change} than "
+            f"odometry's by exp({abs(self.likelier):.0f}), and further from the truth with a "
+            f"probability of {self.doubt:.2g}"
         )
 
 

@@ -4,8 +4,9 @@ Two figures, for poses X of K key poses that readings z have corrected from thos
 
 1. **The evidence.** By how much the readings are likelier at X than at O, with the field integrated
    out and their noise the likeliest at each, less what X costs against odometry:
-   ``log p(z | X) - log p(z | O) - c(X)``. With tiles the poses are integrated out, too
-   (:func:`narrowing`).
+   ``log p(z | X) - log p(z | O) - c(X)``. X are integrated out, too (Laplace): less by how much
+   readings narrow the volume of poses, as those that fit their readings by chance are narrowed as
+   much as others (:func:`narrowing`; :mod:`.path_information` for one field).
 2. **The doubt.** Readings fit poses that they have moved themselves better than others, by
    hundreds of nats even where these are further off: a path that is right in itself may be turned
    as a whole. How far is in the sigmas. With positions ``x = x_X + e``, e of covariance P
@@ -155,8 +156,7 @@ def narrowing(mapped: FieldSolution, options: SlamOptions) -> float:
     """Return by how much readings narrow the volume of poses that odometry and scans allow.
 
     Half of the logarithm of ``det(Q) / det(P)``, with the covariances Q and P of poses, and of
-    calibrations that are variables, without readings and with them. Poses that fit their readings
-    by chance are narrowed as much as others: integrated out, the fit has to pay for it.
+    calibrations that are variables, without readings and with them.
     """
     drive, tiles = mapped.solution.drive, mapped.tiled.tiles
     priors, values = drive_graph(drive), drive_values(drive, mapped.solution.poses)

@@ -54,11 +54,14 @@ class PathInformation:
         Root of what readings take from the covariance of K poses, shape (K, 6, q).
     sensor
         Root of what they take from that of (t, C row by row, H), shape (15, q).
+    narrowed
+        By how much readings narrow the volume of the path's errors, in nats.
     """
 
     odometry: Marginals
     learnt: FloatArray
     sensor: FloatArray
+    narrowed: float
 
     def pose_covariances(self) -> FloatArray:
         """Return covariances of right perturbations of the key poses, shape (K, 6, 6)."""
@@ -81,7 +84,9 @@ class PathInformation:
 
 def path_information(near: "PathNeighbourhood") -> PathInformation:
     """Return what readings determine of a path."""
-    return PathInformation(near.odometry, *near.moved_by(determined(near)))
+    taken = determined(near)
+    learnt, sensor = near.moved_by(taken)
+    return PathInformation(near.odometry, learnt, sensor, near.narrowed(taken))
 
 
 def determined(near: "PathNeighbourhood", count: int = VECTORS) -> FloatArray:
@@ -154,6 +159,15 @@ class PathNeighbourhood:
     def size(self) -> int:
         """Number n of errors."""
         return self._steps + len(self.sensor)
+
+    def narrowed(self, taken: FloatArray) -> float:
+        """Return minus half the log determinant of the covariance P of the path's errors.
+
+        ``taken`` is the result of ``determined``. With those U of its rows that are not the
+        sensor's, ``P = I - U U^T`` has the determinant of ``I - U^T U``.
+        """
+        U = taken[: self._steps]
+        return -0.5 * float(np.linalg.slogdet(np.eye(U.shape[1]) - U.T @ U)[1])
 
     def slopes(self, errors: FloatArray) -> FloatArray:
         """Return the derivatives of minus the log density where errors are so, both (n,)."""

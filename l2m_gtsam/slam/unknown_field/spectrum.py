@@ -169,20 +169,26 @@ class SpectrumLikelihood:
 
     def correction(self, at: FloatArray) -> FloatArray:
         """Return the likeliest A, h there, shape (12,)."""
-        information, _ = self._without_field(at)
+        information, _ = self._without_field(self.prior(at), self.noise(at))
         return self._likeliest(information)
 
     def log_likelihood(self, at: FloatArray) -> float:
         """Return the log likelihood there, but for constants."""
-        information, volume = self._without_field(at)
+        return self.log_likelihood_of(self.prior(at), self.noise(at))
+
+    def log_likelihood_of(self, prior: PotentialHyperparameters, noise: SensorNoise) -> float:
+        """Return the log likelihood of a field and a noise, but for constants."""
+        information, volume = self._without_field(prior, noise)
         return self._by_distortion(information) - volume
 
-    def _without_field(self, at: FloatArray) -> tuple[FloatArray, float]:
+    def _without_field(
+        self, prior: PotentialHyperparameters, noise: SensorNoise
+    ) -> tuple[FloatArray, float]:
         """Return the information about A, h with the field integrated out, and its volume."""
         waves = len(self._basis)
         columns = self._columns.copy()
-        columns[:, :, :waves] *= np.sqrt(self._basis.variances(self.prior(at)))
-        volume = AXES * whiten(self.noise(at), self._seconds, columns.reshape(self._count, -1))
+        columns[:, :, :waves] *= np.sqrt(self._basis.variances(prior))
+        volume = AXES * whiten(noise, self._seconds, columns.reshape(self._count, -1))
         white = columns.reshape(AXES * self._count, -1)
         every = white.T @ white
         known, shared = np.eye(waves) + every[:waves, :waves], every[:waves, waves:]

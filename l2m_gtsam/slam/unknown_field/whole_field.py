@@ -24,6 +24,7 @@ from l2m_gtsam.slam.unknown_field.spectrum import (
     SHORTEST_M,
     FieldSpectrum,
     LearntReadings,
+    SpectrumLikelihood,
     learnt_spectrum,
 )
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile, TiledDrive
@@ -33,6 +34,7 @@ LEAST_WAVES = 50
 # In the logarithm of the likelihood, of which five parameters are learnt: more is no chance.
 CLEAR = 10.0
 LONGER = 1.05  # lengths are tried that are so many times the one before
+COMPARED_BY = 3000  # readings, of which features of a fine field take 44 MB
 
 
 @dataclass(frozen=True)
@@ -205,14 +207,33 @@ def spectrum_at(
 
     The field's length is ``shortest_m`` at least; other parameters as of ``learnt_prior``.
     """
-    where = relative_place(drive.readings, poses, 0, drive.sensors)
-    x, R = where.x, where.readings.R_map_lidar
-    few = np.linspace(0, len(x) - 1, min(len(x), LEARNT_FROM)).round().astype(int)
-    corrected = np.einsum("nji,nj->ni", R, where.field(drive.sensors))
-    seconds = 1e-9 * (drive.reading_ns - drive.stamp_ns[0])
-    readings = LearntReadings(x[few], R[few], corrected[few], seconds[few])
+    readings = readings_at(drive, poses, LEARNT_FROM)
     distortion, offset = options.distortion, options.offset
     return learnt_spectrum(readings, distortion, offset, detail.learnt_with, first, shortest_m)
+
+
+def log_likelihood_at(
+    drive: Drive, poses: list[gtsam.Pose3], options: WholeFieldOptions, spectrum: FieldSpectrum
+) -> float:
+    """Return how likely a drive's readings are at an estimate of its poses, but for constants.
+
+    A fine field, and what C and H of the sensor are wrong by, are integrated out; parameters as of
+    ``learnt_prior``.
+    """
+    readings = readings_at(drive, poses, COMPARED_BY)
+    distortion, offset = options.distortion, options.offset
+    likelihood = SpectrumLikelihood(readings, distortion, offset, FINE.learnt_with)
+    return likelihood.log_likelihood_of(spectrum.prior, spectrum.noise)
+
+
+def readings_at(drive: Drive, poses: list[gtsam.Pose3], most: int) -> LearntReadings:
+    """Return readings of a drive at an estimate of its poses, so many at most."""
+    where = relative_place(drive.readings, poses, 0, drive.sensors)
+    x, R = where.x, where.readings.R_map_lidar
+    few = np.linspace(0, len(x) - 1, min(len(x), most)).round().astype(int)
+    corrected = np.einsum("nji,nj->ni", R, where.field(drive.sensors))
+    seconds = 1e-9 * (drive.reading_ns - drive.stamp_ns[0])
+    return LearntReadings(x[few], R[few], corrected[few], seconds[few])
 
 
 def prior_about(

@@ -22,8 +22,11 @@ from l2m_gtsam.slam.pose_graph import drive_graph, drive_values
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import marginals_of
 from l2m_gtsam.slam.unknown_field.gain import gain_of
-from l2m_gtsam.slam.unknown_field.path_information import PathNeighbourhood, path_information
-from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
+from l2m_gtsam.slam.unknown_field.path_information import (
+    PathInformation,
+    PathNeighbourhood,
+    path_information,
+)
 from l2m_gtsam.slam.unknown_field.smoothed_drive import (
     FOLLOWED,
     OFF_LINE,
@@ -41,6 +44,7 @@ from l2m_gtsam.slam.unknown_field.whole_field import (
     WholePrior,
     fine_prior,
     learnt_prior,
+    log_likelihood_at,
     prior_about,
 )
 
@@ -90,13 +94,21 @@ def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> F
         How to solve.
     """
     last, whole = smooth.stage.last, options.whole_field
-    found = with_information(smooth.problem.finished(last), last.values, smooth.prior, smooth.noise)
+    solved = smooth.problem.finished(last)
+    weights = np.maximum(solved.solution.weights, REJECTED_WEIGHT)
+    information = path_information(
+        PathNeighbourhood(
+            solved.solution.drive, last.poses, last.values, smooth.prior, smooth.noise, weights
+        )
+    )
+    found = with_information(solved, information)
     odometry = drive.dead_reckoning()
     learnt = fine_prior(drive, last.poses, whole, smooth.prior.spectrum)
     before = fine_prior(drive, odometry, whole, smooth.first.spectrum)
-    likelier = learnt.spectrum.log_likelihood - before.spectrum.log_likelihood
-    likelier -= found.solution.bent
-    gain = gain_of(found.solution.poses, odometry, found.marginals, likelier)
+    likelier = log_likelihood_at(drive, last.poses, whole, learnt.spectrum)
+    likelier -= log_likelihood_at(drive, odometry, whole, before.spectrum)
+    likelier -= found.solution.bent + information.narrowed
+    gain = gain_of(found.solution.poses, odometry, information, likelier)
     if gain.shown:
         settled = is_settled(smooth.stage, found.solution)
         ending = Ending.TOLERANCE if settled else Ending.ITERATION_LIMIT
@@ -111,28 +123,14 @@ def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> F
     return replace(found, solution=solution, gain=gain, returns=returned(p, drive.steps.path, near))
 
 
-def with_information(
-    found: FieldSolution, values: gtsam.Values, prior: WholePrior, noise: SensorNoise
-) -> FieldSolution:
-    """Return a solved drive with the covariances of its density without weights.
-
-    Parameters
-    ----------
-    found, values
-        The solution of the graph of poses and weights.
-    prior, noise
-        Of the field and of the readings in that graph.
-    """
-    solution = found.solution
-    drive, weights = solution.drive, np.maximum(solution.weights, REJECTED_WEIGHT)
-    information = path_information(
-        PathNeighbourhood(drive, solution.poses, values, prior, noise, weights)
-    )
-    jumps = [information.step_covariance(each.step) for each in drive.jumps]
+def with_information(found: FieldSolution, information: PathInformation) -> FieldSolution:
+    """Return a solved drive with the covariances of its density without weights."""
+    solution, taken = found.solution, information.sensor
+    jumps = [information.step_covariance(each.step) for each in solution.drive.jumps]
     solution = replace(
         solution,
         pose_covariance=information.pose_covariances(),
-        calibration_covariance=drive.sensors.covariance - information.sensor @ information.sensor.T,
+        calibration_covariance=solution.drive.sensors.covariance - taken @ taken.T,
         step_covariance=np.reshape(jumps, solution.step_covariance.shape),
     )
     return replace(found, solution=solution, marginals=information)

@@ -84,8 +84,16 @@ def step(request: pytest.FixtureRequest) -> Step:
     )
 
 
-def dense(step: Step) -> FloatArray:
-    """Return the covariance of both poses and the sensor, (27, 27), by differences of the cost."""
+@dataclass(frozen=True)
+class DenseInformation:
+    """Covariances of both poses and the sensor, (27, 27), and of the path's errors."""
+
+    covariance: FloatArray
+    of_path: FloatArray
+
+
+def dense(step: Step) -> DenseInformation:
+    """Return the covariances by second differences of the cost."""
     drive, sensors = step.drive, step.drive.sensors
     order = gtsam.Ordering()
     for key in (X(0), X(1), V()):
@@ -116,7 +124,7 @@ def dense(step: Step) -> FloatArray:
     P = np.eye(n) - (vectors * (known / (1 + known))) @ vectors.T
     by = np.zeros((27, n))
     by[:12, : len(J)], by[12:, len(J) :] = back[:12], C
-    return np.asarray(by @ P @ by.T)
+    return DenseInformation(by @ P @ by.T, P[: len(J), : len(J)])
 
 
 def test_covariances_are_those_of_dense_second_derivatives(step: Step) -> None:
@@ -124,7 +132,8 @@ def test_covariances_are_those_of_dense_second_derivatives(step: Step) -> None:
     found = path_information(
         PathNeighbourhood(step.drive, step.poses, step.values, step.prior, NOISE, ones)
     )
-    expected = dense(step)
+    by_differences = dense(step)
+    expected = by_differences.covariance
     scale = np.sqrt(np.diag(expected))
     own = found.step_covariance(0) / np.outer(scale[:12], scale[:12])
     # Retracted poses bend readings between them, which is of second order in a step's error.
@@ -135,6 +144,9 @@ def test_covariances_are_those_of_dense_second_derivatives(step: Step) -> None:
     np.testing.assert_allclose(blocks[1], found.step_covariance(0)[6:, 6:], rtol=1e-6, atol=1e-12)
     sensor = step.drive.sensors.covariance[0] - found.sensor @ found.sensor.T
     np.testing.assert_allclose(np.diag(sensor), np.diag(expected)[12:], rtol=0.05, atol=1e-9)
+    narrowed = -0.5 * np.linalg.slogdet(by_differences.of_path)[1]
+    assert narrowed > 0.2
+    assert found.narrowed == pytest.approx(narrowed, abs=0.06)  # as above, of 18 errors
 
 
 def test_a_variance_along_a_direction_is_that_of_the_joint_covariance(step: Step) -> None:
