@@ -1,8 +1,9 @@
 r"""A slow error of one sensor's readings: an Ornstein-Uhlenbeck process.
 
 Readings are off by ``s n(t)``, with n of unit variance and ``E n(t) n(t') = exp(-|t - t'| / tau)``
-along each axis of the sensor: motors, thrusters, field that a model does not hold. Its values at
-the key poses are variables ``N(k)``, a Markov chain
+along each axis of the sensor. t is the time of what lasts, as of motors and thrusters, or the path
+to detail of the field that a model does not hold; tau has the same unit. Its values at the key
+poses are variables ``N(k)``, a Markov chain
 
 .. math::
     n_{k+1} = a n_k + \sqrt{1 - a^2} \, w, \quad a = \exp(-\Delta / \tau), \quad w \sim N(0, I)
@@ -27,7 +28,7 @@ from l2m_factors.field_map import FloatArray
 from l2m_factors.keys import N
 
 AXES = 3
-LEAST_S = 1e-6  # between two key poses
+LEAST = 1e-6  # between two key poses, seconds or metres
 
 
 @dataclass(frozen=True)
@@ -79,19 +80,19 @@ class SlowBridge:
     covariance: FloatArray
 
 
-def slow_bridge(before_s: FloatArray, after_s: FloatArray, tau_s: float) -> SlowBridge:
+def slow_bridge(before: FloatArray, after: FloatArray, tau: float) -> SlowBridge:
     """Return what the errors at two key poses say of those between them.
 
     Parameters
     ----------
-    before_s, after_s
-        Time from the first key pose to each reading, and from there to the second, seconds,
+    before, after
+        Time or path from the first key pose to each reading, and from there to the second,
         shapes (n,).
-    tau_s
-        Time over which the error changes, seconds.
+    tau
+        Time or path over which the error changes.
     """
-    a, b = before_s / tau_s, after_s / tau_s
-    whole = np.expm1(-2 * np.maximum(a + b, LEAST_S / tau_s))
+    a, b = before / tau, after / tau
+    whole = np.expm1(-2 * np.maximum(a + b, LEAST / tau))
     shares = np.column_stack([np.exp(-a) * np.expm1(-2 * b), np.exp(-b) * np.expm1(-2 * a)])
     shares = shares / whole[:, None]
     alike = np.exp(-np.abs(np.subtract.outer(a, a)))
@@ -99,19 +100,19 @@ def slow_bridge(before_s: FloatArray, after_s: FloatArray, tau_s: float) -> Slow
     return SlowBridge(shares, 0.5 * (covariance + covariance.T))
 
 
-def slow_error_graph(key_pose_s: FloatArray, tau_s: float) -> gtsam.NonlinearFactorGraph:
+def slow_error_graph(key_poses: FloatArray, tau: float) -> gtsam.NonlinearFactorGraph:
     """Return the prior of the errors ``N(k)`` at K key poses.
 
     Parameters
     ----------
-    key_pose_s
-        Their times in seconds, shape (K,).
-    tau_s
-        Time over which the error changes, seconds.
+    key_poses
+        Their times, or the path to them, shape (K,).
+    tau
+        Time or path over which the error changes.
     """
     graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(AXES)
     graph.add(gtsam.PriorFactorVector(N(0), np.zeros(AXES), unit))
-    decays = np.exp(-np.maximum(np.diff(key_pose_s), LEAST_S) / tau_s)
+    decays = np.exp(-np.maximum(np.diff(key_poses), LEAST) / tau)
     for k, a in enumerate(decays.tolist()):
         root = np.eye(AXES) / np.sqrt(1 - a**2)
         linear = gtsam.JacobianFactor(N(k), -a * root, N(k + 1), root, np.zeros(AXES), unit)

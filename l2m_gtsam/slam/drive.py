@@ -17,6 +17,7 @@ from l2m_gtsam.slam.options import DriftOptions
 
 # Of the first pose, rad^2 and m^2, where no start is given: it defines the frame of the poses.
 EXACT_START = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
+STANDING_M_S = 1e-3  # path that a second adds: what lasts over a path does not last for ever
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,18 @@ class Drive:
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
+
+    @property
+    def progress(self) -> FloatArray:
+        """Path to each of the K key poses by odometry, shape (K,), metres; see ``STANDING_M_S``."""
+        standing = STANDING_M_S * 1e-9 * (self.stamp_ns - self.stamp_ns[0])
+        return np.asarray(self.steps.path + standing)
+
+    @property
+    def progress_at_readings(self) -> FloatArray:
+        """The same of the N readings, shape (N,)."""
+        progress, key = self.progress, self.readings.key_pose
+        return np.asarray(progress[key] + self.readings.fraction * np.diff(progress)[key])
 
     def until(self, count: int) -> "Drive":
         """Return the drive as it is up to so many key poses."""

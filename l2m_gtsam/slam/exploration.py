@@ -142,10 +142,10 @@ def noise_notes(found: SensorNoise | None, sensors: KnownSensors) -> NoiseNotes:
     if found is None:
         return NoiseNotes()
     stated = float(np.sqrt(np.mean(sensors.noise**2)))
-    if found.slow_s > 0:  # of one sensor in one field
+    if found.slow_m > 0:  # of one sensor in one field
         own = (
             f"readings of {sensors.names[0]} are off by {found.white_ut:.2g} uT each and by "
-            f"{found.slow_ut:.2g} uT that last {found.slow_s:.2g} s, by the drive itself; its "
+            f"{found.slow_ut:.2g} uT over {found.slow_m:.2g} m of path, by the drive itself; its "
             f"calibration states {stated:.2g} uT"
         )
         return NoiseNotes(warnings=(own,))

@@ -130,7 +130,7 @@ def logged_trajectory(lines: Sequence[LogLine]) -> Trajectory:
 
 
 KIND = "online-state"
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,11 @@ from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, end_state, smoo
 from l2m_gtsam.slam.unknown_field.whole_field import COARSE, WholePrior, full_prior, spectrum_at
 from l2m_gtsam.solve.chi_square import exceeded_by
 
-# Of the filter's noise. Slow errors count as white there: of errors that last 3 to 4 s, with a
-# reading each 0.43 s, white ones 3.7 to 4.5 times as large say as much. On the model ship 3,
-# after a last stage with 1.5, and 4, after one with 2, leave the same errors; NEES is 4.5 and 3.7.
+# Of the filter's noise, at least. Slow errors count as white there: of errors that last over a
+# metre of path, with a reading each 0.12 m, white ones 4.1 times as large say as much. On the model
+# ship 3, after a last stage with 1.5, and 4, after one with 2, leave the same errors.
 NOISE_FACTOR = 3.0
+WHITE_SHARE = 0.75  # of white noise that says as much: what that is on the model ship
 GROWN = 1.4  # path, after which the drive is solved again: all takes 3.5 times the last solution
 LEFT = 1.25  # the same where the vehicle has left the box, or a correction was refused
 NEAR = 1.0  # lengths of the field, to the faces of the box: nearer, these matter
@@ -321,6 +322,13 @@ class OneFieldExplorer:
         self._learnt_m = self._path_m
         self._has_refused = True
 
+    def _mean_distance(self) -> float:
+        """Return the path between two readings in metres, in the mean of what was learnt from."""
+        path = np.cumsum([each.length_m * (each.number > 0) for each in self.key_poses])
+        count = np.searchsorted(path, self._learnt_m, side="right")
+        readings = sum(len(each.readings) for each in self.key_poses[:count])
+        return self._learnt_m / max(readings, 1)
+
     def _following(self, prior: WholePrior, beginning: SolvedBeginning | None) -> Pieces:
         """Follow all key poses from a beginning, or the start, on, in pieces.
 
@@ -329,7 +337,9 @@ class OneFieldExplorer:
         options = self._options
         sensors = self._sensors.corrected(prior.spectrum.correction)
         sensors = sensors.loosened(0.0, options.whole_field.offset)
-        noise = np.array([NOISE_FACTOR * prior.spectrum.noise.ut])
+        learnt = prior.spectrum.noise
+        alike = learnt.as_white(self._mean_distance())
+        noise = np.array([max(NOISE_FACTOR * learnt.ut, WHITE_SHARE * alike)])
         follows = FieldFilter(prior.field, replace(sensors, noise=noise), options.robust.largest)
         hypotheses, done = Hypotheses.begun(follows), 1
         if beginning is not None:

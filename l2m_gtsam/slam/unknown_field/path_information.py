@@ -32,7 +32,7 @@ from l2m_gtsam.slam.pose_graph import odometry_graph
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solver import colamd_ordering
 from l2m_gtsam.slam.unknown_field.path_density import PathDensity, PathReadings
-from l2m_gtsam.slam.unknown_field.sensor_noise import NS, NoiseInformation, SensorNoise
+from l2m_gtsam.slam.unknown_field.sensor_noise import NoiseInformation, SensorNoise
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
 from l2m_gtsam.solve.linear_algebra import covariance_root, eigenpairs
 
@@ -148,8 +148,7 @@ class PathNeighbourhood:
         self._root, self._transposed = splu(by_variables), splu(csc_array(by_variables.T))
         motions = RelativeMotions.along(drive, poses)
         readings, self._by_pose = path_readings(motions, poses)
-        seconds = NS * (drive.reading_ns - drive.stamp_ns[0])
-        information = NoiseInformation(noise, seconds, weights)
+        information = NoiseInformation(noise, drive.progress_at_readings, weights)
         self.density = PathDensity(readings, prior.field, information)
         self.sensor = drive.sensors.vectors()[0]
         covariance = drive.sensors.covariance[0]

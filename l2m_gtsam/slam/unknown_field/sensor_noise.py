@@ -1,4 +1,9 @@
-"""What a sensor's readings are off by on a drive: white noise, and an error that lasts."""
+"""What a sensor's readings are off by on a drive: white noise, and an error that lasts.
+
+What lasts is detail of the field that no wave holds. It changes as the vehicle moves, however long
+that takes: readings of two model ships and two sensors in the hand are likelier by exp(63) to
+exp(357) with errors that last over a path than with such that last over a time.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -13,8 +18,7 @@ from l2m_gtsam.solve.linear_algebra import covariance_root
 
 AXES = 3
 LEAST_WHITE = 0.09  # of the variance: what interpolation between key poses leaves is as large
-NS = 1e-9
-LEAST_S = 1e-6  # between two readings
+LEAST_M = 1e-6  # between two readings
 
 
 @dataclass(frozen=True)
@@ -27,13 +31,13 @@ class SensorNoise:
         Standard deviation in uT.
     white
         Share of its variance that is independent from reading to reading.
-    slow_s
-        Time in seconds over which the rest changes: its correlation falls by e.
+    slow_m
+        Path in metres over which the rest changes: its correlation falls by e.
     """
 
     ut: float
     white: float
-    slow_s: float
+    slow_m: float
 
     @property
     def white_ut(self) -> float:
@@ -45,6 +49,17 @@ class SensorNoise:
         """Standard deviation of the other part in uT."""
         return float(self.ut * np.sqrt(1 - self.white))
 
+    def as_white(self, apart_m: float) -> float:
+        """Return the size in uT of white noise that leaves as much in the mean of many readings.
+
+        These are so far apart; with a the correlation of the slow error between two, its variance
+        counts ``(1 + a) / (1 - a)`` times.
+        """
+        if self.white == 1:
+            return self.ut
+        alike = np.exp(-max(apart_m, LEAST_M) / self.slow_m)
+        return float(np.hypot(self.white_ut, self.slow_ut * np.sqrt((1 + alike) / (1 - alike))))
+
     def floored(self) -> "SensorNoise":
         """Return noise that is white enough for interpolated readings."""
         return replace(self, white=max(self.white, LEAST_WHITE))
@@ -54,7 +69,7 @@ class SensorNoise:
         return replace(self, ut=factor * self.ut)
 
 
-def whiten(noise: SensorNoise, seconds: FloatArray, rows: FloatArray) -> float:
+def whiten(noise: SensorNoise, path_m: FloatArray, rows: FloatArray) -> float:
     """Multiply rows by the inverse of the Cholesky factor of N readings' noise along one axis.
 
     The rows become the innovations of a Kalman filter that follows the slow error: in linear time.
@@ -63,8 +78,8 @@ def whiten(noise: SensorNoise, seconds: FloatArray, rows: FloatArray) -> float:
     ----------
     noise
         Of the sensor.
-    seconds
-        Times of the readings in ascending order, shape (N,).
+    path_m
+        Path to the readings in metres in ascending order, shape (N,).
     rows
         Shape (N, q) in C order, changed in place.
 
@@ -74,7 +89,7 @@ def whiten(noise: SensorNoise, seconds: FloatArray, rows: FloatArray) -> float:
         Logarithm of the factor's determinant.
     """
     slow, white = noise.slow_ut**2, noise.white_ut**2
-    return float(write_innovations(np.exp(-np.diff(seconds) / noise.slow_s), slow, white, rows))
+    return float(write_innovations(np.exp(-np.diff(path_m) / noise.slow_m), slow, white, rows))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -107,16 +122,12 @@ class SlowErrors:
     ----------
     noise
         Of the sensor.
-    stamp_ns
-        Times of the K key poses, shape (K,).
-    reading_ns
-        Times of the N readings, shape (N,).
+    key_poses_m, readings_m
+        Path to K key poses and N readings in metres, in ascending order, shapes (K,) and (N,).
     """
 
-    def __init__(self, noise: SensorNoise, stamp_ns: IntArray, reading_ns: IntArray) -> None:
-        self._noise = noise
-        self._key_pose_s = NS * (stamp_ns - stamp_ns[0])
-        self._reading_s = NS * (reading_ns - stamp_ns[0])
+    def __init__(self, noise: SensorNoise, key_poses_m: FloatArray, readings_m: FloatArray) -> None:
+        self._noise, self._key_poses, self._readings = noise, key_poses_m, readings_m
 
     @property
     def white(self) -> float:
@@ -128,20 +139,20 @@ class SlowErrors:
 
         With it what remains, in one standard deviation of each independent error, uT, (n, 3, q).
         """
-        begin, end = self._key_pose_s[key_pose : key_pose + 2]
-        at = np.clip(self._reading_s[rows], begin, end)
-        bridge, ut = slow_bridge(at - begin, end - at, self._noise.slow_s), self._noise.slow_ut
+        begin, end = self._key_poses[key_pose : key_pose + 2]
+        at = np.clip(self._readings[rows], begin, end)
+        bridge, ut = slow_bridge(at - begin, end - at, self._noise.slow_m), self._noise.slow_ut
         left = np.einsum("ij,nm->nimj", ut * np.eye(AXES), covariance_root(bridge.covariance))
         return SlowError(key_pose, ut * bridge.shares), left.reshape(len(rows), AXES, -1)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return their prior."""
-        return slow_error_graph(self._key_pose_s, self._noise.slow_s)
+        return slow_error_graph(self._key_poses, self._noise.slow_m)
 
     def values(self) -> gtsam.Values:
         """Return initial values."""
         values = gtsam.Values()
-        for k in range(len(self._key_pose_s)):
+        for k in range(len(self._key_poses)):
             values.insert(N(k), np.zeros(AXES))
         return values
 
@@ -156,17 +167,17 @@ class NoiseInformation:
     ----------
     noise
         Of the sensor; it is not all white.
-    seconds
-        Times of the readings in ascending order, shape (N,).
+    path_m
+        Path to the readings in metres in ascending order, shape (N,).
     weights
         By which the white part's variance is divided for each, shape (N,).
     """
 
-    def __init__(self, noise: SensorNoise, seconds: FloatArray, weights: FloatArray) -> None:
+    def __init__(self, noise: SensorNoise, path_m: FloatArray, weights: FloatArray) -> None:
         self._white = weights / noise.white_ut**2
-        a = np.exp(-np.maximum(np.diff(seconds), LEAST_S) / noise.slow_s)
+        a = np.exp(-np.maximum(np.diff(path_m), LEAST_M) / noise.slow_m)
         known = 1 / (noise.slow_ut**2 * (1 - a**2))
-        band = np.zeros((2, len(seconds)))  # lower form: the diagonal, and what is below it
+        band = np.zeros((2, len(path_m)))  # lower form: the diagonal, and what is below it
         band[0] = self._white
         band[0, 0] += 1 / noise.slow_ut**2
         band[0, :-1] += a**2 * known

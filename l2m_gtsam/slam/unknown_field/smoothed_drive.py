@@ -248,7 +248,7 @@ def stage_problem(
     refined = options.model_copy(
         update={"calibration": CalibrationUse.REFINED, "max_iterations": iterations}
     )
-    slow = SlowErrors(noise, drive.stamp_ns, drive.reading_ns)
+    slow = SlowErrors(noise, drive.progress, drive.progress_at_readings)
     heard = replace(drive, sensors=with_noise(drive.sensors, noise))
     return TiledProblem(heard, prior.divided, refined, weights_last, slow, CLOSE)
 

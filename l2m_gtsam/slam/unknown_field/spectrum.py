@@ -30,10 +30,10 @@ SAME = 1e-7  # decrease of a cost that is none
 EVALUATIONS = 200  # of the likelihood; a search takes 60 to 110
 STEP, GAIN = 1e-3, 1e-4  # of the differences that are its slopes; share of it that is worth a step
 # Logarithms of: strength in that of the readings, length in m, noise in the same strength, odds of
-# white against slow noise, time of the latter in s.
-FIRST = np.array([0.0, 0.0, -2.0, -2.0, 0.7])
-LOWEST = np.array([-3.0, -1.2, -6.0, -7.0, -3.0])
-HIGHEST = np.array([3.0, 3.0, 1.0, 7.0, 4.0])
+# white against slow noise, path of the latter in m.
+FIRST = np.array([0.0, 0.0, -2.0, -2.0, -0.5])
+LOWEST = np.array([-3.0, -1.2, -6.0, -7.0, -4.0])
+HIGHEST = np.array([3.0, 3.0, 1.0, 7.0, 3.0])
 LENGTH = 1  # which of them that is
 SHORTEST_M, LONGEST_M = (float(np.exp(each[LENGTH])) for each in (LOWEST, HIGHEST))
 
@@ -48,14 +48,14 @@ class LearntReadings:
         Positions in metres (N, 3), rotations from the vehicle's axes (N, 3, 3).
     field
         Along the axes of the vehicle, corrected by the calibration, uT, shape (N, 3).
-    seconds
-        Their times in ascending order, shape (N,).
+    path_m
+        Path to them in metres in ascending order, shape (N,).
     """
 
     x: FloatArray
     R: FloatArray
     field: FloatArray
-    seconds: FloatArray
+    path_m: FloatArray
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class SpectrumLikelihood:
         first = PotentialHyperparameters(sigma=self._strength, length=1.0)
         low, high = x.min(axis=0) - MARGIN, x.max(axis=0) + MARGIN
         self._basis = PotentialBasis.over(low, high, first, eigenfunctions)
-        self._seconds = readings.seconds
+        self._path_m = readings.path_m
         # Side by side, so that both are made white at once: features of the waves, and derivatives
         # of the corrected readings by A and h.
         waves = len(self._basis)
@@ -188,7 +188,7 @@ class SpectrumLikelihood:
         waves = len(self._basis)
         columns = self._columns.copy()
         columns[:, :, :waves] *= np.sqrt(self._basis.variances(prior))
-        volume = AXES * whiten(noise, self._seconds, columns.reshape(self._count, -1))
+        volume = AXES * whiten(noise, self._path_m, columns.reshape(self._count, -1))
         white = columns.reshape(AXES * self._count, -1)
         every = white.T @ white
         known, shared = np.eye(waves) + every[:waves, :waves], every[:waves, waves:]

@@ -232,8 +232,7 @@ def readings_at(drive: Drive, poses: list[gtsam.Pose3], most: int) -> LearntRead
     x, R = where.x, where.readings.R_map_lidar
     few = np.linspace(0, len(x) - 1, min(len(x), most)).round().astype(int)
     corrected = np.einsum("nji,nj->ni", R, where.field(drive.sensors))
-    seconds = 1e-9 * (drive.reading_ns - drive.stamp_ns[0])
-    return LearntReadings(x[few], R[few], corrected[few], seconds[few])
+    return LearntReadings(x[few], R[few], corrected[few], drive.progress_at_readings[few])
 
 
 def prior_about(

@@ -13,14 +13,14 @@ from l2m_gtsam.slam.unknown_field.whole_field import WholeField
 
 COUNT, STEP = 25, 1e-5
 NOISE = SensorNoise(0.8, 0.2, 1.5)
-SECONDS = np.cumsum(np.random.default_rng(8).uniform(0.1, 0.9, COUNT))
+PATH_M = np.cumsum(np.random.default_rng(8).uniform(0.1, 0.9, COUNT))
 WEIGHTS = np.random.default_rng(9).uniform(0.2, 1.0, COUNT)
 PRIOR = PotentialHyperparameters(sigma=4.0, length=0.7)
 
 
 def noise_covariance() -> FloatArray:
     """Along one axis, by its definition."""
-    alike = np.exp(-np.abs(np.subtract.outer(SECONDS, SECONDS)) / NOISE.slow_s)
+    alike = np.exp(-np.abs(np.subtract.outer(PATH_M, PATH_M)) / NOISE.slow_m)
     return np.asarray(NOISE.slow_ut**2 * alike + np.diag(NOISE.white_ut**2 / WEIGHTS))
 
 
@@ -41,11 +41,11 @@ def sensor() -> FloatArray:
 
 
 def density(readings: PathReadings, field: WholeField) -> PathDensity:
-    return PathDensity(readings, field, NoiseInformation(NOISE, SECONDS, WEIGHTS))
+    return PathDensity(readings, field, NoiseInformation(NOISE, PATH_M, WEIGHTS))
 
 
 def test_the_noise_has_the_inverse_of_its_covariance() -> None:
-    found = NoiseInformation(NOISE, SECONDS, WEIGHTS)(np.eye(COUNT))
+    found = NoiseInformation(NOISE, PATH_M, WEIGHTS)(np.eye(COUNT))
     np.testing.assert_allclose(found @ noise_covariance(), np.eye(COUNT), atol=1e-9)
 
 
@@ -128,7 +128,7 @@ def test_the_likeliest_weights_follow_path_and_sensor() -> None:
         return np.asarray(np.linalg.solve(information, F.T @ white[:, -1]))
 
     own = PathDensity(
-        PathReadings(readings.R, readings.p, z), field, NoiseInformation(quiet, SECONDS, WEIGHTS)
+        PathReadings(readings.R, readings.p, z), field, NoiseInformation(quiet, PATH_M, WEIGHTS)
     )
     found = own.weights(likeliest(still, at), at)
     F = features(still, at)

@@ -22,7 +22,7 @@ from l2m_gtsam.slam.unknown_field.path_information import (
     path_information,
     path_readings,
 )
-from l2m_gtsam.slam.unknown_field.sensor_noise import NS, NoiseInformation, SensorNoise
+from l2m_gtsam.slam.unknown_field.sensor_noise import NoiseInformation, SensorNoise
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
 from l2m_gtsam.studies.slam.methods import as_recorded
@@ -100,8 +100,7 @@ def dense(step: Step) -> DenseInformation:
         order.push_back(key)
     J, _ = odometry_graph(drive).linearize(step.values).jacobian(order)
     back, C = np.linalg.inv(J), np.linalg.cholesky(sensors.covariance[0])
-    seconds = np.asarray(NS * drive.reading_ns, dtype=np.float64)
-    noise = NoiseInformation(NOISE, seconds, np.ones(len(drive.readings)))
+    noise = NoiseInformation(NOISE, drive.progress_at_readings, np.ones(len(drive.readings)))
     at = sensors.vectors()[0]
 
     def cost(errors: FloatArray) -> float:

@@ -9,33 +9,33 @@ from hypothesis import strategies as st
 from l2m_factors import N, SlowError, slow_bridge, slow_error_graph
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors, whiten
 
-TIMES = np.array([0.0, 0.4, 1.0, 1.1, 3.0])
+PATH = np.array([0.0, 0.4, 1.0, 1.1, 3.0])
 
 
 def test_the_chain_has_the_process_covariance() -> None:
     tau = 0.8
     values = gtsam.Values()
-    for k in range(len(TIMES)):
+    for k in range(len(PATH)):
         values.insert(N(k), np.zeros(3))
-    marginals = gtsam.Marginals(slow_error_graph(TIMES, tau), values)
-    keys = [N(k) for k in range(len(TIMES))]
+    marginals = gtsam.Marginals(slow_error_graph(PATH, tau), values)
+    keys = [N(k) for k in range(len(PATH))]
     joint = marginals.jointMarginalCovariance(keys).fullMatrix()
-    expected = np.exp(-np.abs(np.subtract.outer(TIMES, TIMES)) / tau)
+    expected = np.exp(-np.abs(np.subtract.outer(PATH, PATH)) / tau)
     np.testing.assert_allclose(joint, np.kron(expected, np.eye(3)), atol=1e-9)
 
 
 def test_errors_cost_what_the_process_has_them_cost() -> None:
     """Half of n^T K^-1 n along each axis, wherever the graph is linearised."""
     tau, rng, values = 0.8, np.random.default_rng(2), gtsam.Values()
-    n = rng.normal(size=(len(TIMES), 3))
+    n = rng.normal(size=(len(PATH), 3))
     for k, own in enumerate(n):
         values.insert(N(k), own)
-    graph = slow_error_graph(TIMES, tau)
-    K = np.exp(-np.abs(np.subtract.outer(TIMES, TIMES)) / tau)
+    graph = slow_error_graph(PATH, tau)
+    K = np.exp(-np.abs(np.subtract.outer(PATH, PATH)) / tau)
     cost = 0.5 * float(np.sum(n * np.linalg.solve(K, n)))
     assert graph.error(values) == pytest.approx(cost, rel=1e-9)
     best = values.retract(graph.linearize(values).optimize())
-    for k in range(len(TIMES)):
+    for k in range(len(PATH)):
         np.testing.assert_allclose(best.atVector(N(k)), 0.0, atol=1e-9)
 
 
@@ -45,14 +45,14 @@ def test_errors_cost_what_the_process_has_them_cost() -> None:
     st.floats(1e-2, 1e2),
 )
 def test_a_bridge_is_the_process_given_its_ends(
-    shares: list[float], whole_s: float, tau_s: float
+    shares: list[float], whole: float, tau: float
 ) -> None:
     """Against the conditional distribution of a joint normal one, by its definition."""
-    t = whole_s * np.array(shares)
-    every = np.concatenate([[0.0, whole_s], t])
-    K = np.exp(-np.abs(np.subtract.outer(every, every)) / tau_s)
+    t = whole * np.array(shares)
+    every = np.concatenate([[0.0, whole], t])
+    K = np.exp(-np.abs(np.subtract.outer(every, every)) / tau)
     mean = np.linalg.solve(K[:2, :2], K[:2, 2:]).T
-    found = slow_bridge(t, whole_s - t, tau_s)
+    found = slow_bridge(t, whole - t, tau)
     # Ends that are nearly the same leave few digits of the definition: 1e-16 / 1e-5.
     np.testing.assert_allclose(found.shares, mean, atol=1e-8)
     np.testing.assert_allclose(found.covariance, K[2:, 2:] - mean @ K[:2, 2:], atol=1e-8)
@@ -61,13 +61,12 @@ def test_a_bridge_is_the_process_given_its_ends(
 def test_what_readings_have_of_it_has_its_variance() -> None:
     """Means of both ends and what remains together: s^2 at each reading, as it was told."""
     noise = SensorNoise(2.0, 0.25, 1.5)
-    stamps = (1e9 * TIMES).astype(np.int64)
     at = np.array([1.2, 2.0, 2.9])
-    error, left = SlowErrors(noise, stamps, (1e9 * at).astype(np.int64)).of(3, np.arange(3))
-    ends = np.exp(-np.abs(np.subtract.outer(TIMES[3:], TIMES[3:])) / noise.slow_s)
+    error, left = SlowErrors(noise, PATH, at).of(3, np.arange(3))
+    ends = np.exp(-np.abs(np.subtract.outer(PATH[3:], PATH[3:])) / noise.slow_m)
     covariance = error.shares @ ends @ error.shares.T
     covariance += np.einsum("nim,kim->nk", left, left) / 3
-    expected = noise.slow_ut**2 * np.exp(-np.abs(np.subtract.outer(at, at)) / noise.slow_s)
+    expected = noise.slow_ut**2 * np.exp(-np.abs(np.subtract.outer(at, at)) / noise.slow_m)
     np.testing.assert_allclose(covariance, expected, atol=1e-8)
 
 
@@ -90,22 +89,34 @@ def test_noise_is_split() -> None:
     assert SensorNoise(1.0, 1e-6, 1.0).floored().white_ut == pytest.approx(0.3)
 
 
+@pytest.mark.parametrize("slow_m", [0.05, 1.0, 3.0])
+def test_white_noise_that_says_as_much_has_the_variance_of_a_mean(slow_m: float) -> None:
+    """Of 4,000 readings: what the two ends of them lack is under a percent."""
+    noise, count, apart = SensorNoise(0.8, 0.2, slow_m), 4000, 0.12
+    path = apart * np.arange(count)
+    alike = np.exp(-np.abs(np.subtract.outer(path, path)) / slow_m)
+    covariance = noise.slow_ut**2 * alike + noise.white_ut**2 * np.eye(count)
+    expected = np.sqrt(covariance.sum() / count)
+    assert noise.as_white(apart) == pytest.approx(expected, rel=0.01)
+    assert SensorNoise(0.8, 1.0, 0.0).as_white(apart) == 0.8
+
+
 @given(
     white=st.floats(1e-3, 1 - 1e-3),
-    slow_s=st.floats(0.05, 50.0),
+    slow_m=st.floats(0.05, 50.0),
     apart=st.lists(st.floats(0.0, 10.0), min_size=1, max_size=12),
 )
 def test_rows_are_made_white_as_by_the_cholesky_factor(
-    white: float, slow_s: float, apart: list[float]
+    white: float, slow_m: float, apart: list[float]
 ) -> None:
-    """Readings at one time, too: their white noise is their own."""
-    noise, seconds = SensorNoise(0.7, white, slow_s), np.cumsum(apart)
-    alike = np.exp(-np.abs(np.subtract.outer(seconds, seconds)) / slow_s)
-    covariance = noise.slow_ut**2 * alike + noise.white_ut**2 * np.eye(len(seconds))
+    """Readings at one place, too: their white noise is their own."""
+    noise, path = SensorNoise(0.7, white, slow_m), np.cumsum(apart)
+    alike = np.exp(-np.abs(np.subtract.outer(path, path)) / slow_m)
+    covariance = noise.slow_ut**2 * alike + noise.white_ut**2 * np.eye(len(path))
     lower = np.linalg.cholesky(covariance)
-    rows = np.random.default_rng(0).normal(size=(len(seconds), 4))
+    rows = np.random.default_rng(0).normal(size=(len(path), 4))
     expected = np.linalg.solve(lower, rows)
-    volume = whiten(noise, seconds, rows)
+    volume = whiten(noise, path, rows)
     # The covariance is at worst 1e4 times worse conditioned than its white part.
     np.testing.assert_allclose(rows, expected, rtol=1e-9, atol=1e-9)
     assert volume == pytest.approx(np.log(np.diag(lower)).sum(), rel=1e-9, abs=1e-9)

@@ -17,15 +17,15 @@ from l2m_gtsam.slam.unknown_field.spectrum import (
 )
 
 STRENGTH, LENGTH = 8.0, 1.0
-COUNT, PERIOD = 250, 0.4
+COUNT, APART_M = 250, 0.4
 WAVES = 200
 
 
-def slow_noise(noise: SensorNoise, seconds: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return white noise and a slow error at some times in uT, shape (N, 3)."""
-    alike = np.exp(-np.abs(np.subtract.outer(seconds, seconds)) / noise.slow_s)
-    root = np.linalg.cholesky(alike + 1e-9 * np.eye(len(seconds)))
-    white, slow = rng.normal(size=(2, len(seconds), 3))
+def slow_noise(noise: SensorNoise, path_m: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return white noise and a slow error along a path in uT, shape (N, 3)."""
+    alike = np.exp(-np.abs(np.subtract.outer(path_m, path_m)) / noise.slow_m)
+    root = np.linalg.cholesky(alike + 1e-9 * np.eye(len(path_m)))
+    white, slow = rng.normal(size=(2, len(path_m), 3))
     return np.asarray(noise.white_ut * white + noise.slow_ut * root @ slow)
 
 
@@ -38,9 +38,9 @@ def read(noise: SensorNoise, C: FloatArray, seed: int) -> LearntReadings:
     prior = PotentialHyperparameters(sigma=STRENGTH * LENGTH, length=LENGTH)
     basis = PotentialBasis.over(x.min(axis=0) - 2, x.max(axis=0) + 2, prior, 200)
     weights = np.sqrt(basis.variance) * rng.normal(size=len(basis))
-    seconds = PERIOD * np.arange(COUNT, dtype=np.float64)
+    path_m = APART_M * np.arange(COUNT, dtype=np.float64)
     b = np.einsum("nji,nj->ni", R, basis.features(x) @ weights)
-    return LearntReadings(x, R, b @ C.T + slow_noise(noise, seconds, rng), seconds)
+    return LearntReadings(x, R, b @ C.T + slow_noise(noise, path_m, rng), path_m)
 
 
 def test_lasting_noise_is_told_from_white_noise_and_from_the_field() -> None:
@@ -49,7 +49,7 @@ def test_lasting_noise_is_told_from_white_noise_and_from_the_field() -> None:
     found = learnt_spectrum(read(true, np.eye(3), 0), 0.01, 1.0, WAVES)
     assert found.noise.ut == pytest.approx(true.ut, rel=0.35)
     assert found.noise.white_ut == pytest.approx(true.white_ut, rel=0.5)
-    assert true.slow_s / 2.5 < found.noise.slow_s < 2.5 * true.slow_s
+    assert true.slow_m / 2.5 < found.noise.slow_m < 2.5 * true.slow_m
     assert found.prior.length == pytest.approx(LENGTH, rel=0.2)
 
 
@@ -72,7 +72,7 @@ def test_scaling_all_readings_down_is_no_gain() -> None:
     readings = read(true, np.eye(3), 2)
     level = np.einsum("nij,nj->ni", readings.R, readings.field)
     unit = (level - level.mean(axis=0)).std()  # of the strengths below
-    at = np.log([STRENGTH / unit, LENGTH, true.ut / unit, 1.0, true.slow_s])
+    at = np.log([STRENGTH / unit, LENGTH, true.ut / unit, 1.0, true.slow_m])
     tight, wide = (
         SpectrumLikelihood(readings, each, 1.0, WAVES).log_likelihood(at) for each in (0.03, 3.0)
     )
@@ -88,7 +88,7 @@ def test_the_likelihood_does_not_jump_where_the_sensor_is_turned(angle: float) -
     """
     C = Rotation.from_euler("z", angle, degrees=True).as_matrix() @ np.diag([1.3, 0.8, 1.0])
     whole = read(SensorNoise(1.5, 0.1, 3.0), C, 1)
-    few = LearntReadings(whole.x[:120], whole.R[:120], whole.field[:120], whole.seconds[:120])
+    few = LearntReadings(whole.x[:120], whole.R[:120], whole.field[:120], whole.path_m[:120])
     likelihood = SpectrumLikelihood(few, 0.3, 10.0, WAVES)
     first, last = np.array([[0.0, -0.45, -1.5, -5.0, 2.0], [-2.0, -0.9, -4.0, -5.0, 2.5]])
     along = [likelihood.log_likelihood(first + s * (last - first)) for s in np.linspace(0, 1, 41)]
