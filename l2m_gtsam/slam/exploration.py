@@ -145,8 +145,8 @@ def noise_notes(found: SensorNoise | None, sensors: KnownSensors) -> NoiseNotes:
     if found.slow_m > 0:  # of one sensor in one field
         own = (
             f"readings of {sensors.names[0]} are off by {found.white_ut:.2g} uT each and by "
-            f"{found.slow_ut:.2g} uT over {found.slow_m:.2g} m of path, by the drive itself; its "
-            f"calibration states {stated:.2g} uT"
+            f"{found.slow_ut:.2g} uT that last over {found.slow_m:.2g} m of path, by the drive "
+            f"itself; its calibration states {stated:.2g} uT"
         )
         return NoiseNotes(warnings=(own,))
     if found.ut > MISSTATED * stated:

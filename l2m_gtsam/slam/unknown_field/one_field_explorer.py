@@ -36,11 +36,6 @@ from l2m_gtsam.slam.unknown_field.smoothed_drive import ON_LINE, end_state, smoo
 from l2m_gtsam.slam.unknown_field.whole_field import COARSE, WholePrior, full_prior, spectrum_at
 from l2m_gtsam.solve.chi_square import exceeded_by
 
-# Of the filter's noise, at least. Slow errors count as white there: of errors that last over a
-# metre of path, with a reading each 0.12 m, white ones 4.1 times as large say as much. On the model
-# ship 3, after a last stage with 1.5, and 4, after one with 2, leave the same errors.
-NOISE_FACTOR = 3.0
-WHITE_SHARE = 0.75  # of white noise that says as much: what that is on the model ship
 GROWN = 1.4  # path, after which the drive is solved again: all takes 3.5 times the last solution
 LEFT = 1.25  # the same where the vehicle has left the box, or a correction was refused
 NEAR = 1.0  # lengths of the field, to the faces of the box: nearer, these matter
@@ -337,9 +332,8 @@ class OneFieldExplorer:
         options = self._options
         sensors = self._sensors.corrected(prior.spectrum.correction)
         sensors = sensors.loosened(0.0, options.whole_field.offset)
-        learnt = prior.spectrum.noise
-        alike = learnt.as_white(self._mean_distance())
-        noise = np.array([max(NOISE_FACTOR * learnt.ut, WHITE_SHARE * alike)])
+        # The filter knows no slow errors.
+        noise = np.array([prior.spectrum.noise.as_white(self._mean_distance())])
         follows = FieldFilter(prior.field, replace(sensors, noise=noise), options.robust.largest)
         hypotheses, done = Hypotheses.begun(follows), 1
         if beginning is not None:

@@ -55,8 +55,6 @@ class SensorNoise:
         These are so far apart; with a the correlation of the slow error between two, its variance
         counts ``(1 + a) / (1 - a)`` times.
         """
-        if self.white == 1:
-            return self.ut
         alike = np.exp(-max(apart_m, LEAST_M) / self.slow_m)
         return float(np.hypot(self.white_ut, self.slow_ut * np.sqrt((1 + alike) / (1 - alike))))
 

@@ -130,7 +130,9 @@ class Stage:
 
 # The field is fine in the end, where poses are within its short waves, and that stage has to
 # converge: after four iterations poses of a sensor in the hand are up to four times as far off.
-OFF_LINE = (Stage(6.0, 2, 4), Stage(3.0, 2, 4), Stage(1.0, 2, 30, fine_prior))
+# Noise that is learnt at poses which readings have moved is too small: with the poses integrated
+# out (Laplace) readings are likeliest with 1.5 times of it.
+OFF_LINE = (Stage(6.0, 2, 4), Stage(3.0, 2, 4), Stage(1.5, 2, 30, fine_prior))
 # On line a fine field gains nothing, as the filter goes on with coarse poses. Nor do readings with
 # their noise alone: the last poses of a drive so far, which nothing after them holds, follow it.
 ON_LINE = (Stage(4.0, 1, 4), Stage(1.5, 1, 4))

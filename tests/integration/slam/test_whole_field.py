@@ -38,25 +38,6 @@ def test_most_of_a_ships_drift_goes_and_sigmas_are_right(
     assert 3 <= found.nees <= 12
 
 
-@pytest.mark.study
-@pytest.mark.parametrize("seed", [5, 6, 7])
-def test_poses_that_fit_the_first_readings_by_chance_are_not_kept(
-    shared_data: Path, seed: int
-) -> None:
-    """A quarter of a run, whose poses would be 0.06 to 0.3 m further off.
-
-    Readings are likelier by 10 to 13 nats more than these poses cost against odometry. That is less
-    than readings narrow the path.
-    """
-    drive = ship_run(shared_data / SHIP, 2)
-    odometry = drifted(drive.truth, DriftRecipe(), Form.WORLD, seed)
-    rows = np.arange(len(drive.truth) // 4)
-    short = replace(drive, truth=drive.truth[rows], field=drive.field[rows])
-    options = stated_drift(drive.truth, DriftRecipe(), Form.WORLD)
-    found, _ = our_row(short, odometry[rows], options, STATED_UT)
-    assert found.unchanged
-
-
 def test_without_a_field_the_poses_are_those_of_odometry(shared_data: Path) -> None:
     """Readings of noise alone, the same field everywhere: nothing tells one place from another."""
     drive, rng = ship_run(shared_data / SHIP, 2), np.random.default_rng(1)

@@ -50,4 +50,4 @@ def test_what_is_given_is_not_doubted() -> None:
 
 def test_of_one_sensor_noise_that_lasts_is_told_as_well() -> None:
     (text,) = noise_notes(SensorNoise(5.0, 0.36, 2.0), sensors(1)).warnings
-    assert "readings of mag_00 are off by 3 uT each and by 4 uT over 2 m of path" in text
+    assert "readings of mag_00 are off by 3 uT each and by 4 uT that last over 2 m of path" in text

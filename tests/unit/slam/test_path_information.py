@@ -144,8 +144,18 @@ def test_covariances_are_those_of_dense_second_derivatives(step: Step) -> None:
     sensor = step.drive.sensors.covariance[0] - found.sensor @ found.sensor.T
     np.testing.assert_allclose(np.diag(sensor), np.diag(expected)[12:], rtol=0.05, atol=1e-9)
     narrowed = -0.5 * np.linalg.slogdet(by_differences.of_path)[1]
+    # Each of the path's errors is known within 0.03, too, of which few are read at all.
+    assert found.narrowed == pytest.approx(narrowed, abs=0.06)
     assert narrowed > 0.2
-    assert found.narrowed == pytest.approx(narrowed, abs=0.06)  # as above, of 18 errors
+
+
+def test_a_path_is_narrowed_by_the_covariance_of_its_own_errors(step: Step) -> None:
+    ones = np.ones(len(step.drive.readings))
+    near = PathNeighbourhood(step.drive, step.poses, step.values, step.prior, NOISE, ones)
+    taken = 0.1 * np.random.default_rng(5).normal(size=(near.size, 7))
+    P = np.eye(near.size) - taken @ taken.T
+    of_path = P[: near.size - len(near.sensor), : near.size - len(near.sensor)]
+    assert near.narrowed(taken) == pytest.approx(-0.5 * np.linalg.slogdet(of_path)[1], rel=1e-9)
 
 
 def test_a_variance_along_a_direction_is_that_of_the_joint_covariance(step: Step) -> None:
