@@ -1,5 +1,7 @@
 """What is learnt of field and noise from readings at known places."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import Bounds, minimize
@@ -9,6 +11,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.spectrum import (
+    FIRST,
     HIGHEST,
     LOWEST,
     LearntReadings,
@@ -112,6 +115,17 @@ def test_a_search_ends_at_a_maximum() -> None:
         options={"maxfev": 300, "xatol": 0.01, "fatol": 0.02},
     )
     assert -more.fun < found.log_likelihood + 0.5
+
+
+def test_of_two_searches_the_likelier_counts() -> None:
+    readings = read(SensorNoise(1.5, 0.1, 3.0), np.eye(3), 4)
+    found = learnt_spectrum(readings, 0.3, 10.0, WAVES)
+    ends = [
+        learnt_spectrum(readings, 0.3, 10.0, WAVES, replace(found, at=start)).log_likelihood
+        for start in FIRST
+    ]
+    assert len(ends) == 2
+    assert found.log_likelihood == max(ends)
 
 
 def test_a_second_search_begins_where_the_first_ended() -> None:
