@@ -16,6 +16,15 @@ with Sigma held constant: a residual ``|Sigma F(x)^T| / sigma`` of each reading,
 position about that when the tile was made, has the right gradient there, and after a few rounds the
 mode is right. (C. Mallows, Technometrics 15, 1973, counts parameters in this way.)
 
+That is for weights with a prior that is wide on purpose. Where it is the field's own, poses have a
+density with the weights integrated out, whose logarithm has ``-log |K + I| / 2`` beside the least
+cost, with the gradient
+
+.. math::
+    d \log |K + I| = \mathrm{tr}(\Sigma \, dK) = d \sum_i F(x_i) \Sigma F(x_i)^T / \sigma_i^2
+
+and the penalty ``sqrt(F(x) Sigma F(x)^T) / sigma`` makes the mode that of this density.
+
 Where the noise has only a share r of the assumed variance, the weights reduce the cost by no more
 than ``r p / 2``, and a larger penalty pushes poses away from the sources. Mallows estimates the
 noise from the residuals; ``ComplexityPenalty.scaled`` is for that.
@@ -35,7 +44,7 @@ from l2m_factors.tile import TileBatch
 
 @dataclass(frozen=True)
 class ComplexityPenalty:
-    """Shares of n readings in the effective number of parameters of a field.
+    """Shares of n readings in what the weights of a field take up: parameters, or volume.
 
     Attributes
     ----------

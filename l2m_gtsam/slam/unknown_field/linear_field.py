@@ -116,6 +116,14 @@ class LinearField(ABC):
             trust = 1 / np.maximum(off / LARGE, 1.0)
         return weights
 
+    @abstractmethod
+    def penalised(self, covariance: FloatArray) -> FloatArray:
+        """Return the M of a penalty ``sum F M F^T / (2 sigma^2)``, symmetric, shape (m, m).
+
+        ``covariance`` is that of the weights after all readings, shape (m, m); see
+        :class:`l2m_factors.ComplexityPenalty`.
+        """
+
     def information(self, points: FloatArray, variance: FloatArray) -> FloatArray:
         """Return the readings' information about the weights, (m, m); see ``penalty``."""
         F = (self.features(points) / np.sqrt(variance)[:, :, None]).reshape(-1, len(self))
@@ -124,7 +132,7 @@ class LinearField(ABC):
     def penalty(
         self, points: FloatArray, variance: FloatArray, past_information: FloatArray | None = None
     ) -> ComplexityPenalty:
-        """Return each reading's share of the effective number of parameters (Mallows' C_p).
+        """Return each reading's share of the cost that what weights take up of it makes.
 
         Parameters
         ----------
@@ -139,11 +147,12 @@ class LinearField(ABC):
         lower = cholesky(
             known if past_information is None else known + past_information, lower=True
         )
-        spread = cho_solve((lower, True), np.eye(len(self)))
+        weighing = self.penalised(cho_solve((lower, True), np.eye(len(self))))
         root = 1 / np.sqrt(variance)[:, :, None]
-        share = root * (self.features(points) @ spread)
-        value = np.sqrt(np.einsum("nam,nam->n", share, share))
-        by_features = root * (share @ spread) / value[:, None, None]
+        F = root * self.features(points)
+        weighed = F @ weighing
+        value = np.sqrt(np.einsum("nam,nam->n", F, weighed))
+        by_features = root * weighed / value[:, None, None]
         steps = SIDE_M * np.eye(AXES)
         slopes = [
             np.einsum("nam,nam->n", by_features, self.features(points + step))

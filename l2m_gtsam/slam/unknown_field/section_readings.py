@@ -118,7 +118,7 @@ class TileReadings:
                 yield residual.factor()
 
     def penalties(self, tile: RememberedTile) -> Iterator[gtsam.NonlinearFactor]:
-        """Yield the penalties of the parameters that the readings determine (Mallows' C_p)."""
+        """Yield the penalties of the parameters that the readings determine."""
         if not len(self.chosen):
             return
         x = self.laid.placed.x[self.chosen]

@@ -166,6 +166,13 @@ class WaveTile(LinearField):
         wider = np.append(np.ones(3), np.full(len(basis) - 3, WIDER))  # the uniform field is wide
         return cls(basis, wider * learnt, prior)
 
+    def penalised(self, covariance: FloatArray) -> FloatArray:
+        """Return its square: the effective number of parameters (Mallows' C_p).
+
+        With a prior that is wider than learnt, the volume would push poses away from the sources.
+        """
+        return covariance @ covariance
+
     @property
     def half_wave(self) -> float:
         """Half of the shortest wave of floor and ceiling, metres."""

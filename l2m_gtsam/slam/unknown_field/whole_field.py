@@ -74,6 +74,13 @@ class WholeField(LinearField):
         """Return the derivative of a scalar by points (N, 3), of one by features (N, 3, m)."""
         return self.basis.by_points(points, by_features * self.scale)
 
+    def penalised(self, covariance: FloatArray) -> FloatArray:
+        """Return the covariance: the volume of weights, as their prior is the one that was learnt.
+
+        Poses are the mode of their own density then, with the field integrated out.
+        """
+        return covariance
+
     @property
     def half_wave(self) -> float:
         """0: what its waves do not hold is learnt with the noise."""
