@@ -16,9 +16,9 @@ with Sigma held constant: a residual ``|Sigma F(x)^T| / sigma`` of each reading,
 position about that when the tile was made, has the right gradient there, and after a few rounds the
 mode is right. (C. Mallows, Technometrics 15, 1973, counts parameters in this way.)
 
-That is for weights with a prior that is wide on purpose. Where it is the field's own, poses have a
-density with the weights integrated out, whose logarithm has ``-log |K + I| / 2`` beside the least
-cost, with the gradient
+That is for weights with a prior that is wider than learnt. With the prior as learnt, poses have a
+density with the weights integrated out. Its cost has ``log |K + I| / 2`` (the volume) beside the
+least cost of the weights, with the gradient
 
 .. math::
     d \log |K + I| = \mathrm{tr}(\Sigma \, dK) = d \sum_i F(x_i) \Sigma F(x_i)^T / \sigma_i^2
@@ -44,7 +44,7 @@ from l2m_factors.tile import TileBatch
 
 @dataclass(frozen=True)
 class ComplexityPenalty:
-    """Shares of n readings in what the weights of a field take up: parameters, or volume.
+    """Shares of n readings in the penalty: of the parameters of a field, or of its volume.
 
     Attributes
     ----------

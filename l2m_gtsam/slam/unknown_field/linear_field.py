@@ -132,7 +132,7 @@ class LinearField(ABC):
     def penalty(
         self, points: FloatArray, variance: FloatArray, past_information: FloatArray | None = None
     ) -> ComplexityPenalty:
-        """Return each reading's share of the cost that what weights take up of it makes.
+        """Return each reading's share of the penalty of complexity.
 
         Parameters
         ----------
