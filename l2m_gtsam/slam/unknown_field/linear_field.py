@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
+from scipy.linalg import cholesky
 from scipy.spatial import cKDTree
 
 from l2m_factors import ComplexityPenalty, TileField
@@ -117,11 +117,11 @@ class LinearField(ABC):
         return weights
 
     @abstractmethod
-    def penalised(self, covariance: FloatArray) -> FloatArray:
-        """Return the M of a penalty ``sum F M F^T / (2 sigma^2)``, symmetric, shape (m, m).
+    def penalised(self, lower: FloatArray) -> FloatArray:
+        """Return the B of the penalty ``sum |F B|^2 / (2 sigma^2)``, shape (m, m).
 
-        ``covariance`` is that of the weights after all readings, shape (m, m); see
-        :class:`l2m_factors.ComplexityPenalty`.
+        ``lower`` is the Cholesky factor of the weights' information after all readings, shape
+        (m, m); see :class:`l2m_factors.ComplexityPenalty`.
         """
 
     def information(self, points: FloatArray, variance: FloatArray) -> FloatArray:
@@ -147,12 +147,11 @@ class LinearField(ABC):
         lower = cholesky(
             known if past_information is None else known + past_information, lower=True
         )
-        weighing = self.penalised(cho_solve((lower, True), np.eye(len(self))))
+        B = self.penalised(lower)
         root = 1 / np.sqrt(variance)[:, :, None]
-        F = root * self.features(points)
-        weighed = F @ weighing
-        value = np.sqrt(np.einsum("nam,nam->n", F, weighed))
-        by_features = root * weighed / value[:, None, None]
+        share = root * (self.features(points) @ B)
+        value = np.sqrt(np.einsum("nam,nam->n", share, share))
+        by_features = root * (share @ B.T) / value[:, None, None]
         steps = SIDE_M * np.eye(AXES)
         slopes = [
             np.einsum("nam,nam->n", by_features, self.features(points + step))

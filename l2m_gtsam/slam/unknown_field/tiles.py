@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import cho_solve
 from scipy.spatial.transform import Rotation
 
 from l2m_factors import KeyPoseReadings
@@ -166,12 +167,12 @@ class WaveTile(LinearField):
         wider = np.append(np.ones(3), np.full(len(basis) - 3, WIDER))  # the uniform field is wide
         return cls(basis, wider * learnt, prior)
 
-    def penalised(self, covariance: FloatArray) -> FloatArray:
-        """Return its square: the effective number of parameters (Mallows' C_p).
+    def penalised(self, lower: FloatArray) -> FloatArray:
+        """Return the covariance itself: the effective number of parameters (Mallows' C_p).
 
         With a prior that is wider than learnt, the volume would push poses away from the sources.
         """
-        return covariance @ covariance
+        return np.asarray(cho_solve((lower, True), np.eye(len(lower))))
 
     @property
     def half_wave(self) -> float:

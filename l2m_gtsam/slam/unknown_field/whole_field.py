@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.potential import PotentialBasis
@@ -74,12 +75,12 @@ class WholeField(LinearField):
         """Return the derivative of a scalar by points (N, 3), of one by features (N, 3, m)."""
         return self.basis.by_points(points, by_features * self.scale)
 
-    def penalised(self, covariance: FloatArray) -> FloatArray:
-        """Return the covariance: the volume of weights, as their prior is the one that was learnt.
+    def penalised(self, lower: FloatArray) -> FloatArray:
+        """Return the covariance's root: the volume of weights, whose prior is the one learnt.
 
-        Poses are the mode of their own density then, with the field integrated out.
+        Poses go to the mode of their own density then, with the field integrated out.
         """
-        return covariance
+        return np.asarray(solve_triangular(lower, np.eye(len(lower)), lower=True).T)
 
     @property
     def half_wave(self) -> float:

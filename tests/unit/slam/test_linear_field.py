@@ -18,7 +18,10 @@ from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile
 from l2m_gtsam.slam.unknown_field.whole_field import WholeField
 
-SIDE_M = 1e-4  # of differences here: the field is 0.4 m long, so that their third order is 1e-6
+SIDE_M = 1e-4  # of differences
+# The penalty's own are over 1 mm to either side: by a wave of 4 / 0.4 m their third order is
+# (1e-2)^2 / 6 of a slope, 2e-5.
+EXACT = 1e-4
 POINTS = np.random.default_rng(3).uniform(-1.0, 1.0, (30, 3))
 VARIANCE = np.full((30, 3), 0.3**2)
 
@@ -56,7 +59,7 @@ def test_a_penalty_has_the_slope_of_its_cost(
         step = np.zeros_like(POINTS)
         step[n, axis] = SIDE_M
         ahead, behind = cost(field, POINTS + step), cost(field, POINTS - step)
-        assert slope[n, axis] == pytest.approx((ahead - behind) / (2 * SIDE_M), rel=1e-4, abs=1e-6)
+        assert slope[n, axis] == pytest.approx((ahead - behind) / (2 * SIDE_M), rel=EXACT, abs=1e-6)
 
 
 def test_the_readings_share_the_effective_number_of_parameters() -> None:
