@@ -47,10 +47,18 @@ class KnownSensors:
         """Return (t, C row by row, H) of each, shape (S, 15)."""
         return np.hstack([self.t, self.distortion])
 
-    def loosened(self, distortion: float, offset: float) -> "KnownSensors":
-        """Return them with less certain C, and H in uT: by these standard deviations more."""
-        more = np.concatenate([np.zeros(3), np.full(9, distortion**2), np.full(3, offset**2)])
-        return replace(self, covariance=self.covariance + np.diag(more))
+    def at(self, vectors: FloatArray) -> "KnownSensors":
+        """Return them with other estimates of (t, C row by row, H), shape (S, 15)."""
+        return replace(self, t=vectors[:, :3], distortion=vectors[:, 3:])
+
+    def loosened(self, distortion: float, offset: float | FloatArray) -> "KnownSensors":
+        """Return them with less certain C, and H in uT: by these standard deviations more.
+
+        ``offset`` is that of all sensors, or of each, shape (S,).
+        """
+        more = np.zeros((len(self.names), 15))
+        more[:, 3:12], more[:, 12:] = distortion**2, np.reshape(offset, (-1, 1)) ** 2
+        return replace(self, covariance=self.covariance + more[:, :, None] * np.eye(15))
 
     def corrected(self, correction: FloatArray) -> "KnownSensors":
         """Return one sensor whose field is ``A b + h`` where now it is b, of (A row by row, h)."""

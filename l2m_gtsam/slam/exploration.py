@@ -14,6 +14,7 @@ from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import EXACT_START, Drive, KnownSensors
 from l2m_gtsam.slam.held_calibration import held_notes, with_calibration_use
+from l2m_gtsam.slam.key_pose_readings import mean_readings
 from l2m_gtsam.slam.localisation import NO_SCANS, Localisation, prepared
 from l2m_gtsam.slam.options import NEEDS_MAP, CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
@@ -21,6 +22,7 @@ from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.slips import judged, with_open_jumps, with_recorded_jumps
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.unknown_field.gain import with_gain
+from l2m_gtsam.slam.unknown_field.joint_smoother import solve_jointly
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution
 from l2m_gtsam.slam.unknown_field.tiled_stages import map_drive
@@ -88,12 +90,20 @@ def explore(
         DriveLikelihood(drive, options) if has_one_sensor(drive) else None,
     )
     drive = odometry.drive
-    mapped = where_gained(drive, solve_field(drive, options, progress), options)
+    mapped = solve_field(drive, options, progress)
+    joint = None
+    if has_sensors_alone(drive):
+        means, _ = prepared(recording, calibration, options, fewer=mean_readings)
+        heard = replace(drive, readings=means.readings, reading_ns=means.reading_ns)
+        alone = without_field(with_recorded_jumps(drive), options).poses
+        joint = solve_jointly(heard, mapped, alone, options, progress)
+    mapped = where_gained(drive, mapped, options) if joint is None else joint
     refined = options.calibration is CalibrationUse.REFINED and mapped.is_corrected
     kept = calibration if refined else None
     result = localisation_result(drive, mapped.solution, by_scans, kept)
-    # One sensor's C and H are estimated in any case.
-    is_held = options.calibration is CalibrationUse.FIXED and not has_one_sensor(drive)
+    # In one field C and H are estimated in any case.
+    in_tiles = joint is None and not has_one_sensor(drive)
+    is_held = options.calibration is CalibrationUse.FIXED and in_tiles
     held = held_notes(drive) if is_held else ()
     noise = noise_notes(mapped.noise, drive.sensors)
     level = plane_hints(recording.trajectory, options.drift, is_stated=drive.steps.stated)
@@ -175,6 +185,11 @@ def without_field(drive: Drive, options: SlamOptions) -> PoseGraph:
 def has_one_sensor(drive: Drive) -> bool:
     """Return whether a drive has one sensor and nothing else that knows its places."""
     return len(drive.sensors.names) == 1 and not len(drive.links)
+
+
+def has_sensors_alone(drive: Drive) -> bool:
+    """Return whether a drive has several sensors and nothing else that knows its places."""
+    return len(drive.sensors.names) > 1 and not len(drive.links)
 
 
 def solve_field(drive: Drive, options: SlamOptions, progress: Progress) -> FieldSolution:

@@ -1,8 +1,10 @@
 """Readings of a drive relative to its key poses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray, Readings, Trajectory, joined_rows
@@ -10,6 +12,9 @@ from l2m_gtsam.geometry import turn_angle
 
 ARM_M = 1.0  # lever arm that converts a rotation into a distance
 CREEP_M_S = 1e-6  # makes the progress of a parked vehicle increase with time
+
+# Makes readings fewer: of readings, odometry, rows of its key poses, and the most of each sensor.
+Fewer = Callable[[Readings, Trajectory, IntArray, int], Readings]
 
 
 def thinned_readings(
@@ -30,6 +35,43 @@ def thinned_readings(
     """
     key = _key_poses(readings, trajectory, rows)
     return readings[evenly_spread(np.column_stack([key, readings.sensor]), most)]
+
+
+def mean_readings(
+    readings: Readings, trajectory: Trajectory, rows: IntArray, most: int
+) -> Readings:
+    """Return means of readings in order of key poses and sensors, at most so many of each on each.
+
+    The place of a mean is that of its readings' mean position and rotation, which leaves out a
+    twelfth of the square of the way, and of the turn, between the first and the last of them.
+    Parameters as of ``thinned_readings``.
+    """
+    key = _key_poses(readings, trajectory, rows)
+    order = np.lexsort((readings.stamp_ns, readings.sensor, key))
+    if not len(order):
+        return readings
+    groups = np.column_stack([key, readings.sensor])[order]
+    begins = np.flatnonzero(np.append(True, np.diff(groups, axis=0).any(axis=1)))
+    sizes = np.diff(np.append(begins, len(order)))
+    group = np.repeat(np.arange(len(begins)), sizes)
+    nth = np.arange(len(order)) - begins[group]
+    part = nth * np.minimum(most, sizes)[group] // sizes[group]
+    starts = np.flatnonzero(np.append(True, (np.diff(group) > 0) | (np.diff(part) > 0)))
+    counts = np.diff(np.append(starts, len(order)))
+    every, first = readings[order], readings[order[starts]]
+    since = every.stamp_ns - np.repeat(first.stamp_ns, counts)
+
+    def mean(values: FloatArray) -> FloatArray:
+        total = np.add.reduceat(values, starts, axis=0)
+        return np.asarray(total / counts.reshape(-1, *np.ones(total.ndim - 1, dtype=int)))
+
+    return replace(
+        first,
+        stamp_ns=first.stamp_ns + np.rint(mean(since.astype(np.float64))).astype(np.int64),
+        R_map_lidar=Rotation.from_matrix(mean(every.R_map_lidar)).as_matrix(),
+        p_map_lidar=mean(every.p_map_lidar),
+        field=mean(every.field),
+    )
 
 
 def key_pose_readings(

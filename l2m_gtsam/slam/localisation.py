@@ -21,7 +21,7 @@ from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drift import plane_hints
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, odometry_jumps
 from l2m_gtsam.slam.held_calibration import held_notes, with_calibration_use
-from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
+from l2m_gtsam.slam.key_pose_readings import Fewer, key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import key_pose_links, link_stamps
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
 from l2m_gtsam.slam.moved_sensors import calibration_changes, sensor_to_leave_out, without_series
@@ -179,6 +179,7 @@ def prepared(
     calibration: CalibrationResult,
     options: SlamOptions,
     evidence: ScanEvidence = NO_SCANS,
+    fewer: Fewer = thinned_readings,
 ) -> tuple[Drive, tuple[str, ...]]:
     """Return a recording as a drive of its calibrated sensors, and warnings.
 
@@ -186,6 +187,8 @@ def prepared(
     ----------
     recording, calibration, options, evidence
         As of ``localise``.
+    fewer
+        Makes at most ``key_poses.readings`` of a sensor's readings on a key pose.
 
     Raises
     ------
@@ -207,7 +210,7 @@ def prepared(
     rows = np.union1d(key_pose_rows(odometry, options.key_poses), repaired.rows)
     if len(evidence):
         rows = with_rows_at(rows, odometry, link_stamps(evidence))
-    readings = thinned_readings(readings, odometry, rows, options.key_poses.readings)
+    readings = fewer(readings, odometry, rows, options.key_poses.readings)
     drive = Drive(
         stamp_ns=odometry.stamp_ns[rows],
         steps=odometry_steps(odometry, rows, options.drift, repaired.jumps),

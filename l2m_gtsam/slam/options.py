@@ -88,7 +88,7 @@ class TileOptions(Options):
 
 
 class WholeFieldOptions(Options):
-    """The one field of a drive with a single sensor, where there is no map."""
+    """The one field of a drive with a single sensor, or with several in a room, without a map."""
 
     waves: int = Field(default=500, ge=50, le=2000)
     """The most eigenfunctions. Where a coarse field needs more, it is described by tiles; the fine
@@ -104,6 +104,10 @@ class WholeFieldOptions(Options):
     online_distortion: float = Field(default=0.03, gt=0)
     """The same on line, where the drive so far is short: beside errors of the poses and an unknown
     field it does not determine as much, and poses follow what is wrong."""
+    entries: int = Field(default=1_000_000, ge=0)
+    """Of several sensors, off line: the most readings (means between key poses) times waves. Where
+    there would be more, tiles alone describe the field; so they do with 0. A drive with as many
+    takes some two minutes of a processor."""
     solve_after_m: float = Field(default=10.0, gt=0)
     """On line, path length with readings after which the drive is solved for the first time, and
     again whenever it has grown by two fifths."""

@@ -79,6 +79,11 @@ def prepared_drive(
     return replace(drive, start=replace(drive.start, covariance=EXACT_START)), true
 
 
+TILES_ALONE = {"entries": 0}  # several sensors have no field in common
+
+
 def explored(drive: SlamDrive, sensors: tuple[KnownSensor, ...], **options: object) -> Localisation:
-    chosen = SlamOptions.model_validate({"key_poses": COARSE, **options})
+    """Return a drive solved in tiles, unless options say otherwise."""
+    given = {"key_poses": COARSE, "whole_field": TILES_ALONE, **options}
+    chosen = SlamOptions.model_validate(given)
     return explore(drive.recording, calibrated(sensors), chosen, silent)

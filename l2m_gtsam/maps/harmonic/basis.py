@@ -10,7 +10,7 @@ from l2m_gtsam.data import FieldAndGradient, FloatArray
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles, moment_features
 from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, UniformField, WeightPrior
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
-from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
+from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, Modes, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.training import TrainingSet
@@ -100,6 +100,30 @@ class Basis:
         """Columns of each family."""
         ends = np.cumsum([len(family) for family in self.families]).tolist()
         return tuple(slice(end - len(f), end) for end, f in zip(ends, self.families, strict=True))
+
+
+@dataclass(frozen=True)
+class WaveBasis(Basis):
+    """The uniform field, and floor and ceiling waves of a box."""
+
+    families: tuple[UniformField | Modes, ...]
+
+    @classmethod
+    def over(cls, frame: TileFrame, resolution: Resolution) -> "WaveBasis":
+        """Return all waves of a box that are so long at least; a weak side has none."""
+        floor = modes_up_to(FLOOR, frame.size, 0.0, resolution.floor)
+        ceiling = modes_up_to(CEILING, frame.size, frame.height, resolution.ceiling)
+        waves = [side for side in (floor, ceiling) if len(side)]
+        return cls(frame, (UniformField(UNIFORM_SIGMA), *waves))
+
+    def by_points(self, points: FloatArray, by_features: FloatArray) -> FloatArray:
+        """Return the derivative of a scalar by points (N, 3), of one by features (N, 3, m)."""
+        local, R = self.frame.localise(points), self.frame.R_map_tile
+        own = R.T @ by_features
+        found = np.zeros_like(points)
+        for columns, family in zip(self.columns, self.families, strict=True):
+            found += family.by_points(local, np.ascontiguousarray(own[:, :, columns]))
+        return np.asarray(found @ R.T)
 
 
 def batches(count: int) -> Iterator[slice]:

@@ -113,6 +113,10 @@ class UniformField:
         """Return field and gradient; see ``Family``."""
         return np.tile(weights, (len(points), 1)), np.zeros((len(points), 3, 3))
 
+    def by_points(self, points: FloatArray, _: FloatArray) -> FloatArray:
+        """Return the derivative of a scalar by points, none, shape (N, 3)."""
+        return np.zeros_like(points)
+
     def potential_on(
         self, x: FloatArray, y: FloatArray, z: FloatArray, weights: FloatArray
     ) -> FloatArray:

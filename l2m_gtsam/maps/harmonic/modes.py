@@ -113,6 +113,20 @@ class Modes:
         add_waves(points, steps, self.z, self.numbers, self.kz, weights, field, gradient)
         return field, gradient
 
+    def by_points(self, points: FloatArray, by_features: FloatArray) -> FloatArray:
+        """Return the derivative of a scalar by points, shape (N, 3).
+
+        Parameters
+        ----------
+        points
+            In the tile's frame in metres, shape (N, 3).
+        by_features
+            Its derivative by the field of a unit of each mode there, shape (N, 3, m).
+        """
+        found, steps = np.empty((len(points), 3)), np.pi / self.size
+        write_by_points(points, steps, self.z, self.numbers, self.kz, by_features, found)
+        return found
+
     def potential_on(
         self, x: FloatArray, y: FloatArray, z: FloatArray, weights: FloatArray
     ) -> FloatArray:
@@ -271,6 +285,39 @@ def add_waves(
             xz -= k * sc
             yz -= k * cs
         add_symmetric(n, bx, by, bz, xx, yy, zz, xy, xz, yz, field, gradient)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def write_by_points(
+    points: FloatArray,
+    steps: FloatArray,
+    z: float,
+    numbers: IntArray,
+    kz: FloatArray,
+    by_features: FloatArray,
+    found: FloatArray,
+) -> None:
+    """Write the derivative of a scalar by points (N, 3), of one by features; see ``Modes``."""
+    p_most, q_most = 0, 0
+    for m in range(len(numbers)):
+        p_most, q_most = max(p_most, numbers[m, 0]), max(q_most, numbers[m, 1])
+    cos_x, sin_x = np.empty(p_most + 1), np.empty(p_most + 1)
+    cos_y, sin_y = np.empty(q_most + 1), np.empty(q_most + 1)
+    for n in range(len(points)):
+        write_phases(points[n, 0] * steps[0], cos_x, sin_x)
+        write_phases(points[n, 1] * steps[1], cos_y, sin_y)
+        x = y = u = 0.0
+        for m in range(len(numbers)):
+            p, q = numbers[m, 0], numbers[m, 1]
+            kx, ky, k = p * steps[0], q * steps[1], kz[m]
+            e = np.exp((points[n, 2] - z) * k)
+            cc, sc = e * cos_x[p] * cos_y[q], e * kx * sin_x[p] * cos_y[q]
+            cs, ss = e * ky * cos_x[p] * sin_y[q], e * kx * ky * sin_x[p] * sin_y[q]
+            a, b, c = by_features[n, 0, m], by_features[n, 1, m], by_features[n, 2, m]
+            x += b * ss - a * kx * kx * cc - c * k * sc
+            y += a * ss - b * ky * ky * cc - c * k * cs
+            u += k * (c * k * cc - a * sc - b * cs)
+        found[n, 0], found[n, 1], found[n, 2] = x, y, u
 
 
 # In line: a function that a fast kernel calls is compiled in that one's mode, unless it was before.

@@ -1,7 +1,7 @@
-r"""How likely a path is by the readings of one sensor, with the field integrated out.
+r"""How likely a path is by the readings of its sensors, with the field integrated out.
 
 With readings z on a path X, features F of the field's m weights, which are N(0, I), the distortion
-C, H of the sensor, and T the covariance of its noise,
+C, H of each one's sensor, and T the covariance of the noise,
 
 .. math::
     -\log p(z | X) = \frac{1}{2} r^T K^{-1} r + \frac{1}{2} \log |K|, \quad r = z - H, \quad
@@ -12,6 +12,7 @@ move along a circle then, and a tangent takes that for more weight: so a path se
 where nothing holds it. Here weights are no variables.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,15 +20,18 @@ from scipy.linalg import cho_solve, cholesky
 from scipy.spatial.transform import Rotation
 
 from l2m_factors import MagneticReadings, reading_residuals, skew
-from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.unknown_field.sensor_noise import AXES, NoiseInformation
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.slam.unknown_field.sensor_noise import AXES
 from l2m_gtsam.slam.unknown_field.tiled_drive import FieldWithWeights
 from l2m_gtsam.slam.unknown_field.whole_field import WholeField
+
+# The inverse of the covariance of N readings' noise along one axis, times rows (N, q).
+InverseNoise = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
 class PathReadings:
-    """N readings of one sensor at an estimate of a path.
+    """N readings of S sensors at an estimate of a path.
 
     Attributes
     ----------
@@ -35,11 +39,14 @@ class PathReadings:
         The lidar at each reading in the frame of the field, (N, 3, 3) and (N, 3), metres.
     z
         What was read, along the axes of the sensor, uT, shape (N, 3).
+    sensor
+        Number of each one's sensor, shape (N,).
     """
 
     R: FloatArray
     p: FloatArray
     z: FloatArray
+    sensor: IntArray
 
 
 @dataclass(frozen=True)
@@ -53,7 +60,7 @@ class DensitySlopes:
     by_path
         Derivative by a right perturbation of the lidar at each reading, shape (N, 6).
     by_sensor
-        By (t, C row by row, H), shape (15,).
+        By (t, C row by row, H) of each sensor, shape (S, 15).
     """
 
     cost: float
@@ -94,24 +101,27 @@ class PathDensity:
         Of the readings.
     """
 
-    def __init__(self, readings: PathReadings, field: WholeField, noise: NoiseInformation) -> None:
+    def __init__(self, readings: PathReadings, field: WholeField, noise: InverseNoise) -> None:
         self._readings, self._field, self._noise = readings, field, noise
 
-    def slopes(self, moved: FloatArray, sensor: FloatArray) -> DensitySlopes:
+    def slopes(self, moved: FloatArray, sensors: FloatArray) -> DensitySlopes:
         """Return the cost and its slopes at a path beside the estimate.
 
         Parameters
         ----------
         moved
             Right perturbations of the lidar's poses, so small that their rotations add, (N, 6).
-        sensor
-            t, C row by row, and H, shape (15,).
+        sensors
+            t, C row by row, and H of each, shape (S, 15).
         """
         at, N, m = self._readings, len(self._readings.z), len(self._field)
-        t, C, H = sensor[:3], sensor[3:12].reshape(3, 3), sensor[12:]
+        own_sensor = sensors[at.sensor]
+        t, H = own_sensor[:, :3], own_sensor[:, 12:]
+        C = own_sensor[:, 3:12].reshape(N, AXES, AXES)
+        C_back = C.transpose(0, 2, 1)
         turn = moved[:, :3]
         R = at.R @ Rotation.from_rotvec(turn).as_matrix()
-        x = at.p + np.einsum("nij,nj->ni", at.R, moved[:, 3:]) + R @ t
+        x = at.p + np.einsum("nij,nj->ni", at.R, moved[:, 3:]) + np.einsum("nij,nj->ni", R, t)
         own = R.transpose(0, 2, 1) @ self._field.features(x)
         features = C @ own
         flat = features.reshape(AXES * N, m)
@@ -131,25 +141,27 @@ class PathDensity:
         W -= np.outer(alpha, u)
         by_features = W.reshape(N, AXES, m)
         by_C = by_features @ own.transpose(0, 2, 1)  # of each reading, (N, 3, 3)
-        by_place = self._field.by_points(x, (R @ C.T) @ by_features)
+        by_place = self._field.by_points(x, (R @ C_back) @ by_features)
         # A turn w takes b to b - w x b, and the sensor by R (w x t).
         lever = np.einsum("nji,nj->ni", R, by_place)
-        products = C.T @ by_C  # of the derivative by b with b
+        products = C_back @ by_C  # of the derivative by b with b
         by_turn = np.stack(
             [products[:, j, k] - products[:, k, j] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1
         )
         by_turn += np.cross(t, lever)
         by_turn += 0.5 * np.cross(turn, by_turn)  # d Exp(w), to first order in w
         by_shift = np.einsum("nji,nj->ni", at.R, by_place)
-        by_H = -alpha.reshape(N, AXES).sum(axis=0)
+        by_own = np.hstack([lever, by_C.reshape(N, -1), -alpha.reshape(N, AXES)])
+        by_sensor = np.zeros_like(sensors)
+        np.add.at(by_sensor, at.sensor, by_own)
         return DensitySlopes(
             cost=float(fit + np.log(np.diag(lower)).sum()),
             by_path=np.hstack([by_turn, by_shift]),
-            by_sensor=np.concatenate([lever.sum(axis=0), by_C.sum(axis=0).ravel(), by_H]),
+            by_sensor=by_sensor,
         )
 
     def weights(self, weights: FloatArray, sensor: FloatArray) -> WeightsOfPath:
-        """Return how the likeliest weights, (m,), follow path and sensor, to first order.
+        """Return how the likeliest weights, (m,), follow path and one sensor, to first order.
 
         Residuals count as small beside the field: their product with its slopes is left out, as in
         a Gauss-Newton step.

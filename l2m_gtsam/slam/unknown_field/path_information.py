@@ -1,6 +1,6 @@
 r"""What readings determine of a path in an unknown field, by second derivatives of its density.
 
-With xi the errors of odometry in units of their sigmas, c those of the sensor, and B the second
+With xi the errors of odometry in units of their sigmas, c those of the sensors, and B the second
 derivatives of :math:`-\log p(z | X)` by both (see :mod:`.path_density`), the covariance of (xi, c)
 is that of Laplace's approximation,
 
@@ -18,22 +18,22 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
-from l2m_factors import X
+from l2m_factors import G, V, X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.slam.drift import DRIFT
-from l2m_gtsam.slam.drive import Drive, stacked
+from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.marginals import Marginals, pose_covariances
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.pose_graph import odometry_graph
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solver import colamd_ordering
-from l2m_gtsam.slam.unknown_field.path_density import PathDensity, PathReadings
-from l2m_gtsam.slam.unknown_field.sensor_noise import NoiseInformation, SensorNoise
-from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
+from l2m_gtsam.slam.unknown_field.path_density import InverseNoise, PathDensity, PathReadings
+from l2m_gtsam.slam.unknown_field.whole_field import WholeField
 from l2m_gtsam.solve.linear_algebra import covariance_root, eigenpairs
 
 VECTORS = 120  # of Lanczos' iteration; with twice as many sigmas are 4 to 5 % smaller
@@ -44,7 +44,7 @@ SEED = 24  # of the iteration's first vector
 
 @dataclass(frozen=True)
 class PathInformation:
-    """Covariances of a path and its sensor: by odometry, less what readings determine.
+    """Covariances of a path and its sensors: by odometry, less what readings determine.
 
     Attributes
     ----------
@@ -52,15 +52,15 @@ class PathInformation:
         Of the poses by odometry alone.
     learnt
         Root of what readings take from the covariance of K poses, shape (K, 6, q).
-    sensor
-        Root of what they take from that of (t, C row by row, H), shape (15, q).
+    sensors
+        Root of what they take from that of (t, C row by row, H) of each sensor, shape (S, 15, q).
     narrowed
         By how much readings narrow the volume of the path's errors, in nats.
     """
 
     odometry: Marginals
     learnt: FloatArray
-    sensor: FloatArray
+    sensors: FloatArray
     narrowed: float
 
     def pose_covariances(self) -> FloatArray:
@@ -85,8 +85,8 @@ class PathInformation:
 def path_information(near: "PathNeighbourhood") -> PathInformation:
     """Return what readings determine of a path."""
     taken = determined(near)
-    learnt, sensor = near.moved_by(taken)
-    return PathInformation(near.odometry, learnt, sensor, near.narrowed(taken))
+    learnt, sensors = near.moved_by(taken)
+    return PathInformation(near.odometry, learnt, sensors, near.narrowed(taken))
 
 
 def determined(near: "PathNeighbourhood", count: int = VECTORS) -> FloatArray:
@@ -108,22 +108,31 @@ def determined(near: "PathNeighbourhood", count: int = VECTORS) -> FloatArray:
     return np.asarray(vectors[:, known] * np.sqrt(found[known] / (1 + found[known])))
 
 
+@dataclass(frozen=True)
+class ErrorSlopes:
+    """Minus the log density of readings but for constants, and its derivatives by n errors."""
+
+    cost: float
+    by_errors: FloatArray
+
+
 class PathNeighbourhood:
-    """The density of readings where odometry and sensor have other errors than estimated.
+    """The density of readings where odometry and sensors have other errors than estimated.
 
     Errors are those of odometry's steps, start and what they have in common, then those of the
-    sensor, all in units of their sigmas and relative to the estimate.
+    sensors, all in units of their sigmas and relative to the estimate.
 
     Parameters
     ----------
     drive
-        K key poses of one sensor, with its calibration at the estimate and the prior's covariance.
+        K key poses with readings of S sensors, with calibrations at the estimate and the
+        covariances of their priors.
     poses, values
         The estimates, and with them those of odometry's steady drift or scale.
-    prior, noise
-        Of the field and of the readings.
-    weights
-        Robust weight of each reading, positive, shape (N,).
+    field
+        In the frame of the first key pose.
+    noise
+        Of the readings.
     """
 
     def __init__(
@@ -131,9 +140,8 @@ class PathNeighbourhood:
         drive: Drive,
         poses: list[gtsam.Pose3],
         values: gtsam.Values,
-        prior: WholePrior,
-        noise: SensorNoise,
-        weights: FloatArray,
+        field: WholeField,
+        noise: InverseNoise,
     ) -> None:
         graph = odometry_graph(drive)
         linear = graph.linearize(values)
@@ -146,18 +154,27 @@ class PathNeighbourhood:
         at = (row[left].astype(np.int64) - 1, column[left].astype(np.int64) - 1)
         by_variables = csc_array((entry[left], at), shape=shape)
         self._root, self._transposed = splu(by_variables), splu(csc_array(by_variables.T))
+        self._right = np.zeros(self._steps)
+        self._right[row[~left].astype(np.int64) - 1] = entry[~left]
         motions = RelativeMotions.along(drive, poses)
         readings, self._by_pose = path_readings(motions, poses)
-        information = NoiseInformation(noise, drive.progress_at_readings, weights)
-        self.density = PathDensity(readings, prior.field, information)
-        self.sensor = drive.sensors.vectors()[0]
-        covariance = drive.sensors.covariance[0]
-        self._by_sensor = covariance_root(covariance, np.sqrt(np.diag(covariance)))
+        self.density = PathDensity(readings, field, noise)
+        self.sensors = drive.sensors.vectors()
+        self._by_sensor = block_diag(
+            *(covariance_root(P, np.sqrt(np.diag(P))) for P in drive.sensors.covariance)
+        )
+        self._values = values
 
     @property
     def size(self) -> int:
         """Number n of errors."""
-        return self._steps + len(self.sensor)
+        return self._steps + self.sensors.size
+
+    def errors_from(self, stated: KnownSensors) -> FloatArray:
+        """Return the errors of the estimate itself, for calibrations that are stated, (n,)."""
+        off = (self.sensors - stated.vectors()).ravel()
+        own = np.linalg.lstsq(self._by_sensor, off, rcond=None)[0]
+        return np.concatenate([-self._right, own])
 
     def narrowed(self, taken: FloatArray) -> float:
         """Return minus half the log determinant of the covariance P of the path's errors.
@@ -170,11 +187,28 @@ class PathNeighbourhood:
 
     def slopes(self, errors: FloatArray) -> FloatArray:
         """Return the derivatives of minus the log density where errors are so, both (n,)."""
-        poses, sensor = self.moved_by(errors[:, None])
+        return self.density_at(errors).by_errors
+
+    def density_at(self, errors: FloatArray) -> ErrorSlopes:
+        """Return minus the log density of readings where errors (n,) are so, and its slopes."""
+        poses, sensors = self.moved_by(errors[:, None])
         moved = (self._by_pose @ poses.ravel()).reshape(-1, POSE)
-        found = self.density.slopes(moved, self.sensor + sensor[:, 0])
+        found = self.density.slopes(moved, self.sensors + sensors[:, :, 0])
         by_poses, none = self.by_key_poses(found.by_path[None]), np.zeros((1, DRIFT))
-        return np.asarray(self.by_errors(by_poses, none, found.by_sensor[None])[0])
+        by_errors = self.by_errors(by_poses, none, found.by_sensor.reshape(1, -1))[0]
+        return ErrorSlopes(found.cost, np.asarray(by_errors))
+
+    def moved_values(self, errors: FloatArray) -> gtsam.Values:
+        """Return poses, and odometry's steady drift or scale, where errors (n,) are so."""
+        moved, values = self._root.solve(errors[: self._steps]), gtsam.Values()
+        own = moved[: self._others]
+        if self._values.exists(G()):
+            values.insert(G(), self._values.atDouble(G()) + float(own[0]))
+        if self._values.exists(V()):
+            values.insert(V(), self._values.atVector(V()) + own)
+        for k, delta in enumerate(moved[self._others :].reshape(-1, POSE)):
+            values.insert(X(k), self._values.atPose3(X(k)).retract(delta))
+        return values
 
     def by_errors(
         self, by_poses: FloatArray, by_drift: FloatArray, by_sensor: FloatArray
@@ -188,7 +222,7 @@ class PathNeighbourhood:
         by_drift
             By odometry's steady drift, shape (r, 8); it counts where that is a variable.
         by_sensor
-            By (t, C row by row, H), shape (r, 15).
+            By (t, C row by row, H) of each sensor, shape (r, 15 S).
         """
         flat = by_poses.reshape(len(by_poses), -1)
         others = by_drift if self._others == DRIFT else np.zeros((len(flat), self._others))
@@ -201,10 +235,11 @@ class PathNeighbourhood:
         return np.asarray((self._by_pose.T @ flat.T).T.reshape(len(flat), -1, POSE))
 
     def moved_by(self, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return how q errors (n, q) move K poses, (K, 6, q), and the sensor, (15, q)."""
+        """Return how q errors (n, q) move K poses, (K, 6, q), and the sensors, (S, 15, q)."""
         steps = np.asarray(self._root.solve(errors[: self._steps]))
         poses = steps[self._others :].reshape(-1, POSE, errors.shape[1])
-        return poses, np.asarray(self._by_sensor @ errors[self._steps :])
+        sensors = self._by_sensor @ errors[self._steps :]
+        return poses, sensors.reshape(*self.sensors.shape, -1)
 
 
 def path_readings(
@@ -229,4 +264,5 @@ def path_readings(
     column = POSE * of[:, :, None, None] + own
     at = tuple(np.broadcast_to(each, blocks.shape).ravel() for each in (row, column))
     shape = POSE * len(key), POSE * len(poses)
-    return PathReadings(R, p, readings.field), csr_array((blocks.ravel(), at), shape=shape)
+    at_estimate = PathReadings(R, p, readings.field, readings.sensor)
+    return at_estimate, csr_array((blocks.ravel(), at), shape=shape)

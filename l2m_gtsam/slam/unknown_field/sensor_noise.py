@@ -155,6 +155,23 @@ class SlowErrors:
         return values
 
 
+class WhiteInformation:
+    """The inverse of the covariance of N readings' independent noise along one axis.
+
+    Parameters
+    ----------
+    variance
+        Of each in uT^2, shape (N,).
+    """
+
+    def __init__(self, variance: FloatArray) -> None:
+        self._known = 1 / variance
+
+    def __call__(self, rows: FloatArray) -> FloatArray:
+        """Return the inverse times rows, shape (N, q)."""
+        return np.asarray(self._known[:, None] * rows)
+
+
 class NoiseInformation:
     """The inverse of the covariance of N readings' noise along one axis, in linear time.
 

@@ -34,7 +34,11 @@ from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.solver import weights_last
 from l2m_gtsam.slam.unknown_field.field_filter import NO_DRIFT, FieldFilter, FilterState, FilterStep
 from l2m_gtsam.slam.unknown_field.path_information import PathNeighbourhood, determined
-from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
+from l2m_gtsam.slam.unknown_field.sensor_noise import (
+    NoiseInformation,
+    SensorNoise,
+    SlowErrors,
+)
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.tiled_smoother import TiledProblem, TiledRound
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior, fine_prior, learnt_prior
@@ -301,9 +305,10 @@ def end_state(smooth: SmoothedDrive) -> FilterState:
     poses, values = last.poses, last.values
     drive = replace(smooth.drive, sensors=with_noise(last.sensors, smooth.noise))
     robust = np.maximum(last.weights, REJECTED_WEIGHT)
-    near = PathNeighbourhood(drive, poses, values, smooth.prior, smooth.noise, robust)
+    noise = NoiseInformation(smooth.noise, drive.progress_at_readings, robust)
+    near = PathNeighbourhood(drive, poses, values, smooth.prior.field, noise)
     weights, K = values.atVector(M(0)), len(poses)
-    of_path, pose = near.density.weights(weights, near.sensor), poses[0].between(poses[-1])
+    of_path, pose = near.density.weights(weights, near.sensors[0]), poses[0].between(poses[-1])
     m, distortion = len(weights), SENSOR - 3
     steady = values.atVector(V()) if values.exists(V()) else np.zeros(DRIFT)
     # Rows: relative pose, weights, distortion, drift.

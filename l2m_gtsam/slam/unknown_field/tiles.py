@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
-from l2m_gtsam.maps.harmonic.basis import UNIFORM_SIGMA, Basis
-from l2m_gtsam.maps.harmonic.family import Hyperparameters, UniformField
+from l2m_gtsam.maps.harmonic.basis import WaveBasis
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn, maximise
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
-from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
+from l2m_gtsam.maps.harmonic.modes import left_out
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
 from l2m_gtsam.maps.harmonic.tiling import Resolution, resolution_of, surveyed_area
 from l2m_gtsam.maps.training import TrainingSet, cubes_of, merged, training_set
@@ -139,7 +139,7 @@ class WaveTile(LinearField):
     ``prior`` is that from which both follow.
     """
 
-    basis: Basis
+    basis: WaveBasis
     prior: FieldPrior
 
     @classmethod
@@ -159,10 +159,7 @@ class WaveTile(LinearField):
         low, high = float(z.min()), float(z.max())
         size, corner = np.array([edge, edge]), np.array([-edge / 2, -edge / 2, low])
         frame = TileFrame(R_anchor_level, R_anchor_level @ corner, size, high - low)
-        floor = modes_up_to(FLOOR, size, 0.0, prior.resolution.floor)
-        ceiling = modes_up_to(CEILING, size, frame.height, prior.resolution.ceiling)
-        waves = [side for side in (floor, ceiling) if len(side)]  # a weak side has none
-        basis = Basis(frame, (UniformField(UNIFORM_SIGMA), *waves))
+        basis = WaveBasis.over(frame, prior.resolution)
         learnt = np.exp(0.5 * basis.prior(prior.hyperparameters).log_variance)
         wider = np.append(np.ones(3), np.full(len(basis) - 3, WIDER))  # the uniform field is wide
         return cls(basis, wider * learnt, prior)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.basis import WaveBasis
 from l2m_gtsam.maps.potential import PotentialBasis
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.options import WholeFieldOptions
@@ -62,9 +63,9 @@ COARSE, FINE = FieldDetail(200, 3.0), FieldDetail(600, 4.0)
 
 @dataclass(frozen=True)
 class WholeField(LinearField):
-    """The field of a drive in the frame of its first key pose, of eigenfunctions in a box."""
+    """The field of a drive in the frame of its first key pose, of waves in a box."""
 
-    basis: PotentialBasis
+    basis: PotentialBasis | WaveBasis
 
     @classmethod
     def of(cls, basis: PotentialBasis) -> "WholeField":
@@ -129,11 +130,18 @@ class WholePrior:
         self, motions: RelativeMotions, poses: list[gtsam.Pose3], sensors: KnownSensors
     ) -> TiledDrive:
         """Return a drive as a single tile."""
-        everything = np.arange(len(motions.readings))
-        where = relative_place(motions.readings, poses, 0, sensors)
-        tile = OccupiedTile(0, 0, everything, self.field, where)
-        own = Anchoring(np.zeros(1, dtype=np.int64), np.zeros(len(poses), dtype=np.int64))
-        return TiledDrive(own, (tile,), np.zeros_like(motions.readings.field))
+        return single_tile(self.field, motions, poses, sensors)
+
+
+def single_tile(
+    field: WholeField, motions: RelativeMotions, poses: list[gtsam.Pose3], sensors: KnownSensors
+) -> TiledDrive:
+    """Return a drive as a single tile with such a field."""
+    everything = np.arange(len(motions.readings))
+    where = relative_place(motions.readings, poses, 0, sensors)
+    tile = OccupiedTile(0, 0, everything, field, where)
+    own = Anchoring(np.zeros(1, dtype=np.int64), np.zeros(len(poses), dtype=np.int64))
+    return TiledDrive(own, (tile,), np.zeros_like(motions.readings.field))
 
 
 def learnt_prior(

@@ -27,11 +27,11 @@ from l2m_gtsam.slam.unknown_field.path_information import (
     PathNeighbourhood,
     path_information,
 )
+from l2m_gtsam.slam.unknown_field.sensor_noise import NoiseInformation
 from l2m_gtsam.slam.unknown_field.smoothed_drive import (
     FOLLOWED,
     OFF_LINE,
     SmoothedDrive,
-    SolvedStage,
     followed,
     smoothed,
     solved_stage,
@@ -96,10 +96,10 @@ def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> F
     last, whole = smooth.stage.last, options.whole_field
     solved = smooth.problem.finished(last)
     weights = np.maximum(solved.solution.weights, REJECTED_WEIGHT)
+    own = solved.solution.drive
+    noise = NoiseInformation(smooth.noise, own.progress_at_readings, weights)
     information = path_information(
-        PathNeighbourhood(
-            solved.solution.drive, last.poses, last.values, smooth.prior, smooth.noise, weights
-        )
+        PathNeighbourhood(own, last.poses, last.values, smooth.prior.field, noise)
     )
     found = with_information(solved, information)
     odometry = drive.dead_reckoning()
@@ -110,7 +110,7 @@ def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> F
     likelier -= found.solution.bent + information.narrowed
     gain = gain_of(found.solution.poses, odometry, information, likelier)
     if gain.shown:
-        settled = is_settled(smooth.stage, found.solution)
+        settled = is_settled(smooth.stage.before, found.solution)
         ending = Ending.TOLERANCE if settled else Ending.ITERATION_LIMIT
         found = replace(found, solution=replace(found.solution, ending=ending), noise=smooth.noise)
     else:
@@ -125,12 +125,12 @@ def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> F
 
 def with_information(found: FieldSolution, information: PathInformation) -> FieldSolution:
     """Return a solved drive with the covariances of its density without weights."""
-    solution, taken = found.solution, information.sensor
+    solution, taken = found.solution, information.sensors
     jumps = [information.step_covariance(each.step) for each in solution.drive.jumps]
     solution = replace(
         solution,
         pose_covariance=information.pose_covariances(),
-        calibration_covariance=solution.drive.sensors.covariance - taken @ taken.T,
+        calibration_covariance=solution.drive.sensors.covariance - taken @ taken.transpose(0, 2, 1),
         step_covariance=np.reshape(jumps, solution.step_covariance.shape),
     )
     return replace(found, solution=solution, marginals=information)
@@ -148,11 +148,11 @@ def as_calibrated(solution: DriveSolution, sensors: KnownSensors) -> DriveSoluti
     )
 
 
-def is_settled(stage: SolvedStage, solution: DriveSolution) -> bool:
-    """Return whether the last round moved the poses by no more than their sigmas."""
+def is_settled(before: FloatArray, solution: DriveSolution) -> bool:
+    """Return whether poses have moved from ``before``, (K, 3), by no more than their sigmas."""
     _, after = stacked(solution.poses)
     variance = np.trace(solution.pose_covariance[:, 3:, 3:], axis1=1, axis2=2)
-    moved = np.sum((after - stage.before) ** 2, axis=1)
+    moved = np.sum((after - before) ** 2, axis=1)
     return bool(moved.mean() <= SETTLED**2 * variance.mean())
 
 

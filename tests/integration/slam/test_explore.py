@@ -11,7 +11,7 @@ from l2m_gtsam.records.localisation import LocalisationStatus
 from l2m_gtsam.slam.exploration import explore, field_samples
 from l2m_gtsam.slam.localisation import Localisation
 from l2m_gtsam.slam.options import SlamOptions
-from tests.drives.exploring import COARSE, explored
+from tests.drives.exploring import COARSE, TILES_ALONE, explored
 from tests.drives.slam import SlamDrive, calibrated, laps, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
@@ -140,7 +140,7 @@ def test_a_calibration_is_refined_without_a_map() -> None:
     # Tiles that are larger than by default, of as many waves: fewer, in less time. With 100 waves
     # no gain is shown (odometry is nearer with a probability of 7 %).
     chosen = {"key_poses": COARSE, "calibration": "refined", "tiles": {"core": 4.0}}
-    options = SlamOptions.model_validate(chosen)
+    options = SlamOptions.model_validate({**chosen, "whole_field": TILES_ALONE})
     found = explore(drive.recording, rough, options, silent).result
     assert found.calibration is not None
     before, after, nees = [], [], []

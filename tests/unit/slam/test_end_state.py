@@ -17,6 +17,7 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.unknown_field import smoothed_drive as module
 from l2m_gtsam.slam.unknown_field.path_information import PathNeighbourhood, path_information
+from l2m_gtsam.slam.unknown_field.sensor_noise import NoiseInformation
 from l2m_gtsam.slam.unknown_field.smoothed_drive import (
     ON_LINE,
     SmoothedDrive,
@@ -64,9 +65,8 @@ def test_pose_and_sensor_have_the_covariance_of_the_path(
     poses, K = last.poses, len(last.poses)
     drive = replace(smooth.drive, sensors=with_noise(last.sensors, smooth.noise))
     weights = np.maximum(last.weights, REJECTED_WEIGHT)
-    path = path_information(
-        PathNeighbourhood(drive, poses, last.values, smooth.prior, smooth.noise, weights)
-    )
+    noise = NoiseInformation(smooth.noise, drive.progress_at_readings, weights)
+    path = path_information(PathNeighbourhood(drive, poses, last.values, smooth.prior.field, noise))
     ends = path.learnt[[0, -1]].reshape(12, -1)
     joint = path.odometry.joint([X(0), X(K - 1)]) - ends @ ends.T
     relative = poses[0].between(poses[-1])
@@ -81,7 +81,7 @@ def test_pose_and_sensor_have_the_covariance_of_the_path(
         atol=1e-6,
     )
     own = slice(-12 - DRIFT, -DRIFT)
-    distortion = (smooth.drive.sensors.covariance[0] - path.sensor @ path.sensor.T)[3:, 3:]
+    distortion = (smooth.drive.sensors.covariance[0] - path.sensors[0] @ path.sensors[0].T)[3:, 3:]
     np.testing.assert_allclose(
         np.diag(state.covariance)[own], np.diag(distortion), rtol=1e-6, atol=1e-12
     )
@@ -99,8 +99,9 @@ def test_it_is_a_covariance_that_says_more_than_the_priors(smooth: SmoothedDrive
     last = smooth.stage.last
     drive = replace(smooth.drive, sensors=with_noise(last.sensors, smooth.noise))
     robust = np.maximum(last.weights, REJECTED_WEIGHT)
-    near = PathNeighbourhood(drive, last.poses, last.values, smooth.prior, smooth.noise, robust)
-    on_path = near.density.weights(last.values.atVector(M(0)), near.sensor).covariance
+    noise = NoiseInformation(smooth.noise, drive.progress_at_readings, robust)
+    near = PathNeighbourhood(drive, last.poses, last.values, smooth.prior.field, noise)
+    on_path = near.density.weights(last.values.atVector(M(0)), near.sensors[0]).covariance
     # Not to know the path leaves no weight better known.
     assert np.linalg.eigvalsh(weights - on_path).min() > -1e-9
     assert np.trace(on_path) < np.trace(weights) < m

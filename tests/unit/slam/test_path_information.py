@@ -42,6 +42,12 @@ class Step:
     values: gtsam.Values
     prior: WholePrior
 
+    @property
+    def near(self) -> PathNeighbourhood:
+        ones = np.ones(len(self.drive.readings))
+        noise = NoiseInformation(NOISE, self.drive.progress_at_readings, ones)
+        return PathNeighbourhood(self.drive, self.poses, self.values, self.prior.field, noise)
+
 
 @pytest.fixture(
     scope="module",
@@ -108,7 +114,8 @@ def dense(step: Step) -> DenseInformation:
         poses = [pose.retract(off[6 * k : 6 * k + 6]) for k, pose in enumerate(step.poses)]
         readings, _ = path_readings(RelativeMotions.along(drive, poses), poses)
         density = PathDensity(readings, step.prior.field, noise)
-        return density.slopes(np.zeros((len(readings.z), 6)), at + C @ errors[len(J) :]).cost
+        sensor = at + C @ errors[len(J) :]
+        return density.slopes(np.zeros((len(readings.z), 6)), sensor[None]).cost
 
     free = len(J) + (len(C) if np.trace(C) > FREE else 0)  # the others stay as they are
     n = len(J) + len(C)
@@ -127,10 +134,7 @@ def dense(step: Step) -> DenseInformation:
 
 
 def test_covariances_are_those_of_dense_second_derivatives(step: Step) -> None:
-    ones = np.ones(len(step.drive.readings))
-    found = path_information(
-        PathNeighbourhood(step.drive, step.poses, step.values, step.prior, NOISE, ones)
-    )
+    found = path_information(step.near)
     by_differences = dense(step)
     expected = by_differences.covariance
     scale = np.sqrt(np.diag(expected))
@@ -141,7 +145,7 @@ def test_covariances_are_those_of_dense_second_derivatives(step: Step) -> None:
     )
     blocks = found.pose_covariances()
     np.testing.assert_allclose(blocks[1], found.step_covariance(0)[6:, 6:], rtol=1e-6, atol=1e-12)
-    sensor = step.drive.sensors.covariance[0] - found.sensor @ found.sensor.T
+    sensor = step.drive.sensors.covariance[0] - found.sensors[0] @ found.sensors[0].T
     np.testing.assert_allclose(np.diag(sensor), np.diag(expected)[12:], rtol=0.05, atol=1e-9)
     narrowed = -0.5 * np.linalg.slogdet(by_differences.of_path)[1]
     # Each of the path's errors is known within 0.03, too, of which few are read at all.
@@ -150,19 +154,15 @@ def test_covariances_are_those_of_dense_second_derivatives(step: Step) -> None:
 
 
 def test_a_path_is_narrowed_by_the_covariance_of_its_own_errors(step: Step) -> None:
-    ones = np.ones(len(step.drive.readings))
-    near = PathNeighbourhood(step.drive, step.poses, step.values, step.prior, NOISE, ones)
+    near = step.near
     taken = 0.1 * np.random.default_rng(5).normal(size=(near.size, 7))
     P = np.eye(near.size) - taken @ taken.T
-    of_path = P[: near.size - len(near.sensor), : near.size - len(near.sensor)]
+    of_path = P[: near.size - near.sensors.size, : near.size - near.sensors.size]
     assert near.narrowed(taken) == pytest.approx(-0.5 * np.linalg.slogdet(of_path)[1], rel=1e-9)
 
 
 def test_a_variance_along_a_direction_is_that_of_the_joint_covariance(step: Step) -> None:
-    ones = np.ones(len(step.drive.readings))
-    found = path_information(
-        PathNeighbourhood(step.drive, step.poses, step.values, step.prior, NOISE, ones)
-    )
+    found = path_information(step.near)
     d = np.random.default_rng(2).normal(size=12)
     along = found.variance_along({X(0): d[:6], X(1): d[6:]})
     assert along == pytest.approx(float(d @ found.step_covariance(0) @ d), rel=1e-6)

@@ -11,7 +11,12 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import moved
 from l2m_gtsam.slam.drift import PLANE, plane_hints
-from l2m_gtsam.slam.key_pose_readings import evenly_spread, key_pose_readings, thinned_readings
+from l2m_gtsam.slam.key_pose_readings import (
+    evenly_spread,
+    key_pose_readings,
+    mean_readings,
+    thinned_readings,
+)
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.slam.pose_graph import stated_information_root
@@ -172,6 +177,58 @@ def test_readings_hang_where_they_were() -> None:
     # Along a rosette at a speed that hardly varies over 0.2 m.
     np.testing.assert_allclose(fraction, late, atol=0.05)
     assert np.all(fraction[readings.stamp_ns == after] == 1.0)
+
+
+@pytest.mark.parametrize("most", [1, 3, 1000])
+def test_means_are_those_of_readings_between_key_poses(most: int) -> None:
+    """Each reading is in one of them, and their noise falls with the root of how many they are."""
+    drive = rounds(20)
+    rows = key_pose_rows(drive, KeyPoseOptions(distance_m=0.3))
+    n, rng = len(drive), np.random.default_rng(1)
+    sensor, twice = np.repeat(np.arange(2), n), np.concatenate([np.arange(n)] * 2)
+    read = Readings(
+        ("a", "b"),
+        sensor,
+        drive.stamp_ns[twice],
+        drive.R[twice],
+        drive.p[twice],
+        rng.normal(size=(2 * n, 3)),
+    )
+    kept = mean_readings(read, drive, rows, most)
+    key = np.maximum(np.searchsorted(drive.stamp_ns[rows], read.stamp_ns) - 1, 0)
+    groups = [
+        np.flatnonzero((key == k) & (sensor == of)) for k in range(len(rows) - 1) for of in range(2)
+    ]
+    assert len(kept) == sum(min(most, len(own)) for own in groups)
+    if most == 1:
+        expected = np.stack([read.field[own].mean(axis=0) for own in groups])
+        np.testing.assert_allclose(kept.field, expected, atol=1e-12)
+        expected = np.stack([read.p_map_lidar[own].mean(axis=0) for own in groups])
+        np.testing.assert_allclose(kept.p_map_lidar, expected, atol=1e-12)
+    assert np.linalg.det(kept.R_map_lidar) == pytest.approx(1.0)
+    many = len(read) / len(kept)
+    # Of some 130 numbers a standard deviation is known to 6 %.
+    assert kept.field.std() == pytest.approx(1 / np.sqrt(many), rel=0.2)
+    hung = key_pose_readings(kept, drive, rows)
+    assert np.all(np.diff(hung.key_pose) >= 0)
+
+
+def test_means_of_single_readings_are_these() -> None:
+    drive = rounds(5)
+    rows = np.arange(len(drive))
+    at = rows[1:]
+    read = Readings(
+        ("a",),
+        np.zeros(len(at), dtype=np.int64),
+        drive.stamp_ns[at],
+        drive.R[at],
+        drive.p[at],
+        np.random.default_rng(2).normal(size=(len(at), 3)),
+    )
+    means, picked = (each(read, drive, rows, 1) for each in (mean_readings, thinned_readings))
+    np.testing.assert_array_equal(means.field, picked.field)
+    np.testing.assert_array_equal(means.stamp_ns, picked.stamp_ns)
+    np.testing.assert_allclose(means.R_map_lidar, picked.R_map_lidar, atol=1e-12)
 
 
 def test_what_is_read_at_rest_is_behind_no_more_of_the_way() -> None:
