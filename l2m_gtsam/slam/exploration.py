@@ -22,7 +22,7 @@ from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.slips import judged, with_open_jumps, with_recorded_jumps
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.unknown_field.gain import with_gain
-from l2m_gtsam.slam.unknown_field.joint_smoother import solve_jointly
+from l2m_gtsam.slam.unknown_field.joint_smoother import is_sure, solve_jointly
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution
 from l2m_gtsam.slam.unknown_field.tiled_stages import map_drive
@@ -90,14 +90,14 @@ def explore(
         DriveLikelihood(drive, options) if has_one_sensor(drive) else None,
     )
     drive = odometry.drive
-    mapped = solve_field(drive, options, progress)
-    joint = None
-    if has_sensors_alone(drive):
+    found = solve_field(drive, options, progress)
+    tiled, joint = where_gained(drive, found, options), None
+    if has_sensors_alone(drive) and not is_sure(tiled.gain):
         means, _ = prepared(recording, calibration, options, fewer=mean_readings)
         heard = replace(drive, readings=means.readings, reading_ns=means.reading_ns)
         alone = without_field(with_recorded_jumps(drive), options).poses
-        joint = solve_jointly(heard, mapped, alone, options, progress)
-    mapped = where_gained(drive, mapped, options) if joint is None else joint
+        joint = solve_jointly(heard, found, alone, options, progress)
+    mapped = tiled if joint is None else joint
     refined = options.calibration is CalibrationUse.REFINED and mapped.is_corrected
     kept = calibration if refined else None
     result = localisation_result(drive, mapped.solution, by_scans, kept)

@@ -17,6 +17,7 @@ from l2m_gtsam.maps.harmonic.basis import WaveBasis
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.progress import Progress
+from l2m_gtsam.records.localisation import Gain
 from l2m_gtsam.slam.drive import Drive, KnownSensors, stacked
 from l2m_gtsam.slam.map_prediction import poses_in
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, WholeFieldOptions
@@ -51,9 +52,10 @@ from l2m_gtsam.slam.unknown_field.whole_smoother import (
 
 CONVEX = 1.0  # of the loss by which readings are weighed
 MOST_WAVES, FEWEST_WAVES = 900, 50
-# Of the noise of readings, what waves that are left out come to together: when field and noise are
-# learnt, and when poses are solved.
-LEARNT, SOLVED = 0.5, 1.0
+LEARNT = 0.5  # of a reading's noise: what waves that are left out come to when a field is learnt
+# Doubt of a correction by tiles, below which these close all loops, with safer sigmas. Of the robot
+# steady drifts leave 4e-4 at most, walks 5e-3 and more.
+SURE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,11 @@ class JointEstimate:
     values: gtsam.Values
     poses: list[gtsam.Pose3]
     sensors: KnownSensors
+
+
+def is_sure(gain: Gain | None) -> bool:
+    """Return whether what a correction by tiles gains leaves no doubt."""
+    return gain is not None and gain.shown and gain.doubt < SURE
 
 
 def solve_jointly(
@@ -121,7 +128,7 @@ def solve_jointly(
         return None
     for number, stage in enumerate(STAGES):
         progress("solving poses in one field", number / len(STAGES))
-        learnt = prior_about(drive, found.poses, most, learnt)
+        learnt = prior_about(drive, found.poses, most, stage.noise_factor, learnt)
         if learnt is None:
             return None
         # Of a sensor that has changed all readings would be rejected with what is calibrated.
@@ -141,7 +148,11 @@ def solve_jointly(
 
 
 def prior_about(
-    drive: Drive, poses: list[gtsam.Pose3], most: int, first: WavePrior | None
+    drive: Drive,
+    poses: list[gtsam.Pose3],
+    most: int,
+    unheard: float,
+    first: WavePrior | None,
 ) -> WavePrior | None:
     """Learn field and noise at poses, and return them with the waves that readings hear.
 
@@ -153,6 +164,8 @@ def prior_about(
         Estimates.
     most
         Limit of waves.
+    unheard
+        Strength of waves that are not heard, in that of the noise.
     first
         What was learnt at others.
 
@@ -161,7 +174,7 @@ def prior_about(
     What is learnt; None where the field needs more waves than it may have.
     """
     learnt, frame = learnt_about(drive, poses, most, first), box_about(drive, poses)
-    heard = heard_waves(learnt.hyperparameters, frame, most, SOLVED)
+    heard = heard_waves(learnt.hyperparameters, frame, most, unheard)
     return None if heard is None else replace(learnt, basis=WaveBasis.over(frame, heard))
 
 

@@ -46,7 +46,7 @@ ITERATIONS = 40  # of the search; it takes 15 to 30
 DISTORTION, OFFSETS = 12, 3  # numbers of C and H; of the change of H
 OWN = DISTORTION + OFFSETS
 LEAST_CUT, MOST_CUT, CUTS = 1.0, 40.0, 79  # rad/m, of waves that are kept
-FAR_STRONGER, FACTORS = 2.0, 13  # than a reading's noise; factors of it that are tried
+STRONGER, FACTORS = 4.0, 13  # than what counts as unheard; factors of it that are tried
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,10 @@ def heard_waves(
 
     Returns
     -------
-    The longest that are left out; None where these would be ``FAR_STRONGER``.
+    The shortest that are kept; None where the limit leaves out such as are ``STRONGER`` than that.
     """
     edge = float(np.sqrt(np.prod(frame.size)))
-    for times in np.geomspace(unheard, FAR_STRONGER, FACTORS):
+    for times in unheard * np.geomspace(1.0, STRONGER, FACTORS):
         kept = waves_above(hyperparameters, float(times) * hyperparameters.noise)
         if kept.modes(edge) <= most:
             return kept
