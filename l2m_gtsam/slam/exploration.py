@@ -1,5 +1,6 @@
 """Estimate poses and field of a recording together, without a map. Pure: no files."""
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,10 +94,11 @@ def explore(
     found = solve_field(drive, options, progress)
     tiled, joint = where_gained(drive, found, options), None
     if has_sensors_alone(drive) and not is_sure(tiled.gain):
-        means, _ = prepared(recording, calibration, options, fewer=mean_readings)
+        means, _ = prepared(recording, calibration, options, evidence, mean_readings)
         heard = replace(drive, readings=means.readings, reading_ns=means.reading_ns)
         alone = without_field(with_recorded_jumps(drive), options).poses
-        joint = solve_jointly(heard, found, alone, options, progress)
+        with suppress(np.linalg.LinAlgError):  # tiles have a solution
+            joint = solve_jointly(heard, found, alone, options, progress)
     mapped = tiled if joint is None else joint
     refined = options.calibration is CalibrationUse.REFINED and mapped.is_corrected
     kept = calibration if refined else None

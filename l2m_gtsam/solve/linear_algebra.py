@@ -37,9 +37,11 @@ def covariance_root(covariance: FloatArray, sigma: FloatArray | float = 1.0) -> 
         Symmetric matrix, shape (n, n), in squared units.
     sigma
         Scale of each component, shape (n,), by which rows and columns are divided before the
-        decomposition: rad beside uT would lose the smaller ones' digits.
+        decomposition: rad beside uT would lose the smaller ones' digits. Where it is 0, as the
+        standard deviation of what is exact, it counts as 1.
     """
     scale = np.broadcast_to(sigma, len(covariance))
+    scale = np.where(scale > 0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
