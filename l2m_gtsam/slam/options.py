@@ -107,7 +107,7 @@ class WholeFieldOptions(Options):
     entries: int = Field(default=1_000_000, ge=0)
     """Of several sensors, off line: the most readings (means between key poses) times waves. Where
     there would be more, tiles alone describe the field; so they do with 0. A drive with as many
-    takes some two minutes of a processor."""
+    takes two to five minutes of a processor."""
     solve_after_m: float = Field(default=10.0, gt=0)
     """On line, path length with readings after which the drive is solved for the first time, and
     again whenever it has grown by two fifths."""
