@@ -75,8 +75,8 @@ class JointStage:
 
 
 # With the noise alone poses of tiles that are off by half a wave stay there. Then the search goes
-# on: after two stages of the last kind a pass of the robot was 85 mm off with NEES 22, after four 68
-# mm with 12 (249 mm by odometry).
+# on: after two stages of the last kind a pass of the robot was 85 mm off with NEES 22, after four
+# 68 mm with 12 (249 mm by odometry).
 FIRST, LAST = JointStage(4.0, 60), JointStage(1.0, 150)
 STAGES = (FIRST, LAST, LAST, LAST, LAST)
 
