@@ -135,7 +135,7 @@ def solve_jointly(
             return None
         # Of a sensor that has changed all readings would be rejected with what is calibrated.
         before = replace(found, sensors=drive.sensors.at(learnt.sensors))
-        problem = JointProblem.of(drive, learnt, stage.noise_factor, options)
+        problem = OneFieldProblem.of(drive, learnt, stage.noise_factor, options)
         found = problem.likeliest(before, stage.iterations)
     solved = None if learnt is None else with_gain(drive, found, learnt, odometry, options)
     progress("solving poses in one field", 1.0)
@@ -206,7 +206,7 @@ def most_waves(drive: Drive, options: WholeFieldOptions) -> int:
 
 
 @dataclass(frozen=True)
-class JointProblem:
+class OneFieldProblem:
     """A drive in one field.
 
     Attributes
@@ -229,7 +229,7 @@ class JointProblem:
     @classmethod
     def of(
         cls, drive: Drive, prior: WavePrior, noise_factor: float, options: SlamOptions
-    ) -> "JointProblem":
+    ) -> "OneFieldProblem":
         """Return the problem with so many times the noise that is learnt."""
         loose = replace(drive, sensors=drive.sensors.loosened(0.0, prior.offset))
         return cls(loose, prior, noise_factor * prior.noise, options)
@@ -282,7 +282,7 @@ def with_gain(
     options: SlamOptions,
 ) -> FieldSolution:
     """Return the solution at an estimate, with sigmas of its density and what it is worth."""
-    found, information = JointProblem.of(drive, prior, LAST.noise_factor, options).finished(
+    found, information = OneFieldProblem.of(drive, prior, LAST.noise_factor, options).finished(
         estimate
     )
     most = most_waves(drive, options.whole_field)

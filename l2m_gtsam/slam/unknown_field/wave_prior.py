@@ -242,7 +242,7 @@ class WaveLikelihood:
         scale[m:].reshape(-1, OWN)[:, DISTORTION:] = offset[:, None]
         return scale
 
-    def _posterior(self, at: FloatArray) -> "Posterior":
+    def _posterior(self, at: FloatArray) -> "WavePosterior":
         noise, _ = np.split(at[len(NAMES) :], 2)
         known, scale = np.exp(-2 * noise), self._scale(at)
         information = np.tensordot(known, self._grams, axes=1) * np.outer(scale, scale)
@@ -251,11 +251,11 @@ class WaveLikelihood:
         pulled = scale * (known @ self._pulls)
         half = solve_triangular(lower, pulled, lower=True, check_finite=False)
         mean = solve_triangular(lower, half, lower=True, trans="T", check_finite=False)
-        return Posterior(lower, np.asarray(mean), float(half @ half))
+        return WavePosterior(lower, np.asarray(mean), float(half @ half))
 
 
 @dataclass(frozen=True)
-class Posterior:
+class WavePosterior:
     """Weights, errors and changes by all readings, in their standard deviations beforehand.
 
     Attributes
