@@ -1,6 +1,5 @@
 """Estimate poses and field of a recording together, without a map. Pure: no files."""
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,10 +94,7 @@ def explore(
     tiled, joint = where_gained(drive, found, options), None
     if has_sensors_alone(drive) and not is_sure(tiled.gain):
         means, _ = prepared(recording, calibration, options, evidence, mean_readings)
-        heard = replace(drive, readings=means.readings, reading_ns=means.reading_ns)
-        alone = without_field(with_recorded_jumps(drive), options).poses
-        with suppress(np.linalg.LinAlgError):  # tiles have a solution
-            joint = solve_jointly(heard, found, alone, options, progress)
+        joint = in_one_field(drive, means, found, options, progress)
     mapped = tiled if joint is None else joint
     refined = options.calibration is CalibrationUse.REFINED and mapped.is_corrected
     kept = calibration if refined else None
@@ -204,6 +200,21 @@ def solve_field(drive: Drive, options: SlamOptions, progress: Progress) -> Field
     prior = drive_prior(drive, poses, options.tiles)
     progress("learning the field's prior", 1.0)
     return replace(map_drive(drive, poses, prior, options, progress), prior=prior)
+
+
+def in_one_field(
+    drive: Drive, means: Drive, tiled: FieldSolution, options: SlamOptions, progress: Progress
+) -> FieldSolution | None:
+    """Solve a drive of several sensors in one field; parameters as of ``solve_jointly``.
+
+    ``means`` is the drive as it was recorded, with means of its readings.
+    """
+    heard = replace(drive, readings=means.readings, reading_ns=means.reading_ns)
+    odometry = without_field(with_recorded_jumps(drive), options).poses
+    try:
+        return solve_jointly(heard, tiled, odometry, options, progress)
+    except np.linalg.LinAlgError:  # tiles have a solution
+        return None
 
 
 def where_gained(drive: Drive, mapped: FieldSolution, options: SlamOptions) -> FieldSolution:
